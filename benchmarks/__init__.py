@@ -1,4 +1,4 @@
-"""How fast, how right and how robust vijax is: every file asks a question, and is run by itself.
+"""Benchmarks of vijax's speed, accuracy and robustness: every file answers one question, and runs on its own.
 
-`yardstick` holds references in many digits, `peers` and `naive` what others would write, `charts` the pictures.
+`yardstick` holds references in many digits, `peers` and `naive` alternative implementations, `charts` the pictures.
 """

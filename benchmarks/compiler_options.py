@@ -1,4 +1,4 @@
-"""Do the results depend on the compiler? A million impacts of each kind under the options of users and under others.
+"""Do the results depend on the compiler? A million impacts of each kind under the shipped and under other options.
 
     python benchmarks/compiler_options.py                 # all kinds; exit status 1 if a bound is exceeded
     python benchmarks/compiler_options.py --only level    # some kinds
@@ -76,19 +76,19 @@ def plane(kind: str, cells: int) -> dict[str, np.ndarray]:
     """Compute the plane of a kind with the options of this process; arrays by name, [cell]."""
     stiffness: dict[str, Any] = {"kappa_left" if kind == "two walls" else "kappa": np.geomspace(4, 300, cells)}
     axes: dict[str, Any] = {"d": np.linspace(0.05, 0.35, cells), "r": 0.5}
-    found = vijax.sweep(**axes, **stiffness, outputs=OUTPUTS, **PLANES[kind])
-    return {name: np.ravel(found[name].values) for name in OUTPUTS}
+    dataset = vijax.sweep(**axes, **stiffness, outputs=OUTPUTS, **PLANES[kind])
+    return {name: np.ravel(dataset[name].values) for name in OUTPUTS}
 
 
-def compared(kind: str, variant: str, known: dict[str, np.ndarray], found: dict[str, np.ndarray]) -> Row:
-    """Compare a plane with that of the first variant."""
-    same = np.all([known[name] == found[name] for name in LABEL], axis=0)
-    good = same & (known["status"] == 0)
-    periodic, aperiodic = good & (known["period"] > 0) & (known["P"] > 0), good & (known["period"] == 0)
-    apart = found["P"] - known["P"]
-    relative = np.abs(apart[periodic] / known["P"][periodic])
-    z = apart[aperiodic] / np.hypot(known["P_stderr"], found["P_stderr"])[aperiodic]
-    impacts = int(np.nansum(found["periods_run"] * found["impacts_per_period"]))
+def compared(kind: str, variant: str, reference: dict[str, np.ndarray], arrays: dict[str, np.ndarray]) -> Row:
+    """Compare a plane with the plane of the first variant."""
+    same = np.all([reference[name] == arrays[name] for name in LABEL], axis=0)
+    is_ok = same & (reference["status"] == 0)
+    periodic, aperiodic = is_ok & (reference["period"] > 0) & (reference["P"] > 0), is_ok & (reference["period"] == 0)
+    difference = arrays["P"] - reference["P"]
+    relative = np.abs(difference[periodic] / reference["P"][periodic])
+    z = difference[aperiodic] / np.hypot(reference["P_stderr"], arrays["P_stderr"])[aperiodic]
+    impacts = int(np.nansum(arrays["periods_run"] * arrays["impacts_per_period"]))
     error = float(np.sqrt(np.mean(z**2))) if z.size else np.nan
     return Row(kind, variant, impacts, same.size, int(np.sum(~same)), float(relative.max(initial=0.0)), error)
 
@@ -98,13 +98,13 @@ def rows(kinds: Iterable[str], cells: int) -> Iterator[Row]:
     for kind in kinds:
         first: dict[str, np.ndarray] | None = None
         for variant in VARIANTS:
-            found = _in_process(kind, variant, cells)
-            first = first or found
-            yield compared(kind, variant, first, found)
+            arrays = _in_process(kind, variant, cells)
+            first = first or arrays
+            yield compared(kind, variant, first, arrays)
 
 
 def _in_process(kind: str, variant: str, cells: int) -> dict[str, np.ndarray]:
-    """Compute a plane in a process of its own, as its compiler reads the environment once."""
+    """Compute a plane in a separate process, as the compiler reads the environment only once."""
     environment = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "VIJAX_KERNELS")}
     environment |= VARIANTS[variant] | {"PYTHONPATH": str(Path(__file__).parents[1])}
     with tempfile.TemporaryDirectory() as folder:
@@ -123,7 +123,7 @@ def main() -> int:
     )
     parser.add_argument("--only", nargs="+", choices=PLANES, default=list(PLANES), metavar="KIND")
     parser.add_argument("--cells", type=int, default=CELLS, help="cells along each axis (default: %(default)s)")
-    parser.add_argument("--compute", help=argparse.SUPPRESS)  # what a process of its own does: a plane, to a file
+    parser.add_argument("--compute", help=argparse.SUPPRESS)  # for the processes: a plane, to a file
     options = parser.parse_args()
     if options.compute:
         np.savez(options.compute, **plane(options.only[0], options.cells))  # type: ignore[arg-type]

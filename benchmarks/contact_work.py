@@ -1,4 +1,4 @@
-"""How accurate is the energy that an impact under harmonics gives to a membrane?
+"""How accurate is the energy transferred to a membrane by an impact under harmonic excitation?
 
     python benchmarks/contact_work.py               # 256 starts, 8 periods each, all their impacts: four minutes
     python benchmarks/contact_work.py --starts 16
@@ -17,15 +17,15 @@ import mpmath as mp
 import numpy as np
 
 import vijax
-from vijax.engine.forcing import forcing
+from vijax.impact.forcing import forcing_of
 from vijax.model import flow
-from vijax.model.wave_work import wave_work
+from vijax.model.forcing.harmonic_work import harmonic_contact_work
 
 DIGITS = 40
 
 
 class Contact(NamedTuple):
-    """A contact as its onset determines it: duration, exit rate, and energy given to the membrane."""
+    """A contact as determined by its onset: duration, exit rate, and energy transferred to the membrane."""
 
     duration: mp.mpf
     rate: mp.mpf
@@ -36,8 +36,8 @@ def contact(kappa: float, r: float, push: list[tuple[int, Any]], level: float, z
     """Compute a contact in `DIGITS` digits.
 
     Args:
-        kappa, r: Of the wall.
-        push: Orders k and complex amplitudes a of the harmonics, seen from the wall: Re sum a exp(i k pi s).
+        kappa, r: Stiffness and restitution of the wall.
+        push: Orders k and complex amplitudes a of the harmonics, in the wall's direction: Re sum a exp(i k pi s).
         level: Constant part of the push.
         z: Rate of penetration at the onset.
         near: Approximate duration.
@@ -45,14 +45,17 @@ def contact(kappa: float, r: float, push: list[tuple[int, Any]], level: float, z
     kappa, log = mp.mpf(kappa), mp.log(mp.mpf(r))
     zeta = -kappa * log / mp.sqrt(mp.pi**2 + log**2)
     mu, omega = 2 * zeta, mp.sqrt(kappa**2 - zeta**2)
-    # w = sum of A exp(p s): the forced parts, and two free ones that make w and w' those of the onset.
+    # w = sum of A exp(p s): the forced parts, and two free parts that satisfy the onset's w and w'.
     parts = [(mp.mpc(0), mp.mpc(level) / kappa**2)]
     for order, amplitude in push:
         for p, a in ((mp.mpc(0, order * mp.pi), amplitude), (mp.mpc(0, -order * mp.pi), mp.conj(amplitude))):
             parts.append((p, a / 2 / (p * p + mu * p + kappa**2)))
-    one, other = mp.mpc(-zeta, omega), mp.mpc(-zeta, -omega)
+    free_rate, conjugate_rate = mp.mpc(-zeta, omega), mp.mpc(-zeta, -omega)
     w0, z0 = -sum(a for _, a in parts), z - sum(p * a for p, a in parts)
-    parts += [(one, (z0 - other * w0) / (one - other)), (other, (one * w0 - z0) / (one - other))]
+    parts += [
+        (free_rate, (z0 - conjugate_rate * w0) / (free_rate - conjugate_rate)),
+        (conjugate_rate, (free_rate * w0 - z0) / (free_rate - conjugate_rate)),
+    ]
     end = mp.findroot(lambda s: mp.re(sum(a * mp.exp(p * s) for p, a in parts)), mp.mpf(near))
     rates = [(p, p * a) for p, a in parts if p != 0]
     work = sum(
@@ -63,13 +66,13 @@ def contact(kappa: float, r: float, push: list[tuple[int, Any]], level: float, z
 
 def of_impact(pair: Any, excitation: Any, impact: Any) -> Contact:
     """Compute the contact of a recorded impact of one pair in `DIGITS` digits."""
-    made, side = forcing(excitation), int(impact.side)
+    harmonics, side = forcing_of(excitation), int(impact.side)
     here = pair.at(side)
     with mp.workdps(DIGITS):
         turn = mp.pi * mp.mpf(float(impact.t))
         push = [
             (k, side * mp.mpc(float(c), float(q)) * mp.exp(mp.mpc(0, k * turn)))
-            for k, c, q in zip(made.orders, made.cosines, made.sines, strict=True)
+            for k, c, q in zip(harmonics.orders, harmonics.cosines, harmonics.sines, strict=True)
         ]
         numbers = (
             float(here.kappa),
@@ -99,20 +102,25 @@ def errors(case: tuple[Any, tuple[float, float], Any], periods: int) -> np.ndarr
     pair, start, waves = case
     run = vijax.trajectory(pair, *start, periods, excitation=waves)
     filled = int(run.filled)
-    hits = jax.tree.map(lambda x: np.asarray(x)[:filled], run.impacts)
-    closed = np.asarray(_closed_form(pair, run.impacts, forcing(waves)))[:filled]
-    rows = (jax.tree.map(lambda x, k=k: x[k], hits) for k in range(filled))
-    true = [of_impact(pair, waves, row).work for row in rows]
-    found = [[abs(float(work / known - 1)) for known, work in zip(true, of, strict=True)] for of in (hits.work, closed)]
-    return np.array(found).T.reshape(-1, 2)
+    impacts = jax.tree.map(lambda x: np.asarray(x)[:filled], run.impacts)
+    closed = np.asarray(_closed_form(pair, run.impacts, forcing_of(waves)))[:filled]
+    rows = (jax.tree.map(lambda x, k=k: x[k], impacts) for k in range(filled))
+    exact = [of_impact(pair, waves, row).work for row in rows]
+    deviations = [
+        [abs(float(work / exact_work - 1)) for exact_work, work in zip(exact, computed, strict=True)]
+        for computed in (impacts.work, closed)
+    ]
+    return np.array(deviations).T.reshape(-1, 2)
 
 
 @jax.jit
-def _closed_form(pair: Any, hits: Any, shaking: Any) -> Any:
-    """Compute the energy given to the membrane at each impact by the closed form that orbits use."""
-    side = hits.side.astype(float)
-    m, onset = flow.membrane(pair.at(side)), shaking.waves(hits.t)
-    return wave_work(m, onset, pair.gamma, side, hits.duration, (side * hits.v_in, side * hits.v_out))
+def _closed_form(pair: Any, impacts: Any, shaking: Any) -> Any:
+    """Compute the energy transferred to the membrane at each impact by the closed form that orbits use."""
+    side = impacts.side.astype(float)
+    m, onset = flow.membrane(pair.at(side)), shaking.waves(impacts.t)
+    return harmonic_contact_work(
+        m, onset, pair.gamma, side, impacts.duration, (side * impacts.v_in, side * impacts.v_out)
+    )
 
 
 def main() -> None:
@@ -120,10 +128,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--starts", type=int, default=256)
     parser.add_argument("--periods", type=int, default=8)
-    given = parser.parse_args()
-    found = np.concatenate([errors(case, given.periods) for case in drawn(given.starts)])
-    print(f"{len(found):,} impacts of {given.starts:,} starts: relative error of the energy given to the membrane")
-    for name, column in zip(("trajectory", "closed form of orbits"), found.T, strict=True):
+    options = parser.parse_args()
+    deviations = np.concatenate([errors(case, options.periods) for case in drawn(options.starts)])
+    print(
+        f"{len(deviations):,} impacts of {options.starts:,} starts: relative error of the energy given to the membrane"
+    )
+    for name, column in zip(("trajectory", "closed form of orbits"), deviations.T, strict=True):
         figures = np.median(column), np.quantile(column, 0.99), column.max()
         print(f"{name:22} median {figures[0]:.1e}, 99 % {figures[1]:.1e}, largest {figures[2]:.1e}")
 

@@ -1,4 +1,4 @@
-"""What does each thing asked for cost, and is what was not asked for free?
+"""How much time does each output cost, and is an output that is not requested free?
 
     python benchmarks/cost.py           # 128 x 128 cells, 100 periods
     python benchmarks/cost.py --quick   # 32 x 32 cells, 10 periods: does it run?
@@ -45,18 +45,18 @@ FREQUENCIES = 8
 LEVEL, INCLINED = 0.0, (0.1, 0.5)
 STIFF = 400.0
 FRICTION = 0.1
-SPEEDS = 0.6  # starts of the second plane reach from minus to plus it
+SPEEDS = 0.6  # starts of the second plane reach from minus to plus this speed
 
 
 class Contender(NamedTuple):
-    """A sweep, and the contender whose time it is a multiple of."""
+    """A sweep, and the name of the contender for its time ratio."""
 
     call: Callable[[], Any]
     against: str | None
 
 
 def contenders(side: int, periods: int) -> dict[str, Contender]:
-    """Name what is timed."""
+    """Return the timed sweeps by name."""
     d, kappa = axes(side)
     sweep = partial(vijax.sweep, d=d, r=R, u0=U0, until="window", periods=periods)
     plane = partial(sweep, kappa=kappa, v0=V0)
@@ -76,37 +76,37 @@ def contenders(side: int, periods: int) -> dict[str, Contender]:
         "P, ode, friction": Contender(partial(plane, method="ode", friction=FRICTION, outputs=power), "P, ode"),
         "soft, starts": Contender(partial(starts, outputs=power), None),
         "rigid, starts": Contender(partial(starts, wall="rigid", outputs=power), "soft, starts"),
-        # All kappa of a rigid wall are one simulation, so its whole map is.
+        # A rigid wall's motion does not depend on kappa, so the whole map needs one simulation per d.
         "rigid map": Contender(partial(plane, wall="rigid", outputs=power), "P"),
     }
 
 
-def timed(what: str, call: Callable[[], Any], side: int, periods: int, repeat: int) -> Row:
-    """Run a sweep and time it."""
+def timed(name: str, call: Callable[[], Any], side: int, periods: int, repeat: int) -> Row:
+    """Run a sweep and time it; every cell must have a number."""
     start = time.perf_counter()
-    found = call()
+    dataset = call()
     seconds = time.perf_counter() - start
-    counted = found["impacts_per_period"]
-    if lost := int(counted.isnull().sum()):
-        raise SystemExit(f"{what}: {lost} cells without a number")
-    return Row(what, side * side, periods, repeat, seconds, float(counted.sum()) * periods)
+    impacts = dataset["impacts_per_period"]
+    if missing := int(impacts.isnull().sum()):
+        raise SystemExit(f"{name}: {missing} cells without a number")
+    return Row(name, side * side, periods, repeat, seconds, float(impacts.sum()) * periods)
 
 
 def measure(side: int, periods: int, repeats: int) -> Iterator[Row]:
-    """Time all in rounds, so that a ratio compares calls of one moment; the first compiles and is dropped."""
-    entered = contenders(side, periods)
-    rows: dict[str, list[Row]] = {what: [] for what in entered}
-    for what, contender in entered.items():
-        timed(what, contender.call, side, periods, -1)
+    """Time all sweeps in rounds, so that a ratio compares neighbouring calls; the first round compiles only."""
+    sweeps = contenders(side, periods)
+    rows: dict[str, list[Row]] = {name: [] for name in sweeps}
+    for name, contender in sweeps.items():
+        timed(name, contender.call, side, periods, -1)
     for repeat in range(repeats):
-        for what, contender in entered.items():
-            rows[what].append(timed(what, contender.call, side, periods, repeat))
-            yield rows[what][-1]
-    for what, contender in entered.items():
-        typical = statistics.median(row.cell_period for row in rows[what])
-        print(f"{what:16} {typical:8.4f} us per cell-period", end="")
+        for name, contender in sweeps.items():
+            rows[name].append(timed(name, contender.call, side, periods, repeat))
+            yield rows[name][-1]
+    for name, contender in sweeps.items():
+        typical = statistics.median(row.cell_period for row in rows[name])
+        print(f"{name:16} {typical:8.4f} us per cell-period", end="")
         if contender.against is not None:
-            pairs = zip(rows[what], rows[contender.against], strict=True)
+            pairs = zip(rows[name], rows[contender.against], strict=True)
             ratios = [row.seconds / other.seconds for row, other in pairs]
             print(f"   {statistics.median(ratios):6.2f} times {contender.against}", end="")
             print(f" ({min(ratios):.2f} to {max(ratios):.2f})", end="")
@@ -118,12 +118,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="small sizes: does it run?")
     parser.add_argument("--rows", type=Path, default=HERE / "rows", help="folder for the raw rows")
-    given = parser.parse_args()
+    options = parser.parse_args()
 
     print(f"{os.cpu_count()} cores, {jax.devices()[0].device_kind}, JAX {jax.__version__}")
-    rows = measure(32, 10, 3) if given.quick else measure(128, 100, 5)
-    told = ([*row, row.cell_period] for row in rows)
-    tables.write(given.rows / f"cost{'_quick' if given.quick else ''}.csv", [*Row._fields, "us_per_cell_period"], told)
+    rows = measure(32, 10, 3) if options.quick else measure(128, 100, 5)
+    table_rows = ([*row, row.cell_period] for row in rows)
+    tables.write(
+        options.rows / f"cost{'_quick' if options.quick else ''}.csv", [*Row._fields, "us_per_cell_period"], table_rows
+    )
 
 
 if __name__ == "__main__":

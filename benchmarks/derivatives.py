@@ -1,4 +1,4 @@
-"""Derivatives of impacts by differentiating the engine, and by differences in 50 digits."""
+"""Derivatives of impacts by automatic differentiation, and by differences in 50 digits."""
 
 from functools import cache
 
@@ -10,7 +10,7 @@ import numpy as np
 import vijax
 from benchmarks.yardstick import DIGITS, mp_march
 from vijax.model.pair import ImpactPair
-from vijax.runtime.xla import compiler_options
+from vijax.runtime.compilation.xla import compiler_options
 
 IMPACTS, PERIODS = 3, 4
 H = "1e-9"
@@ -21,26 +21,28 @@ RIGID = [(0.12, None, 0.5, 0.0, 0.02, 0.3), (0.25, None, 0.8, 0.1, 0.02, 0.3)]
 
 
 def events(rigid: bool):
-    """Make impacts, as one array [impact, name], a function of the parameters, as one vector."""
+    """Return a function from the vector of parameters to the impacts, [impact, name]."""
 
     def run(x):
         pair = ImpactPair(x[0], None if rigid else x[1], x[2], x[3])
-        hits = vijax.trajectory(pair, x[4], x[5], PERIODS, max_impacts=IMPACTS).impacts
-        time = 2.0 * hits.n.astype(x.dtype) + hits.t
+        impacts = vijax.trajectory(pair, x[4], x[5], PERIODS, max_impacts=IMPACTS).impacts
+        time = 2.0 * impacts.n.astype(x.dtype) + impacts.t
         zero = jnp.zeros_like(time)
-        return jnp.stack([time, hits.v_in, hits.v_out, zero if rigid else hits.depth, hits.duration], axis=-1)
+        return jnp.stack(
+            [time, impacts.v_in, impacts.v_out, zero if rigid else impacts.depth, impacts.duration], axis=-1
+        )
 
     return run
 
 
 @cache
 def marched(case):
-    """Find the impacts of a case in as many digits as are in force, and guesses for its neighbours."""
+    """Return the impacts of a case in the current number of digits, and guesses for neighbouring cases."""
     return mp_march(case, IMPACTS)
 
 
 def differences(case, direction) -> tuple[np.ndarray, np.ndarray]:
-    """Compute first and second derivative along a direction by central differences in 50 digits, [impact, name]."""
+    """Return first and second derivatives along a direction by central differences in 50 digits, [impact, name]."""
     with mp.workdps(DIGITS):
         h = mp.mpf(H)
         middle, guesses = marched(case)
@@ -62,7 +64,7 @@ def differences(case, direction) -> tuple[np.ndarray, np.ndarray]:
 
 
 def derivatives(rigid: bool):
-    """Compute cases, directions, first and second derivatives along them by forward mode, and where they are."""
+    """Return cases, directions, the first and second derivatives along them by forward mode, and the points."""
     cases = RIGID if rigid else SOFT
     directions = np.delete(np.eye(6), 1, axis=0) if rigid else np.eye(6)
     mixed = np.random.default_rng(0).uniform(-1, 1, 6)
@@ -77,16 +79,16 @@ def derivatives(rigid: bool):
         return jax.jvp(slope, (x,), (w,))
 
     points = jnp.asarray([[0.0 if x is None else x for x in case] for case in cases])
-    every = jax.vmap(jax.vmap(jet, (None, 0)), (0, None))
-    first, second = jax.jit(every, compiler_options=compiler_options())(points, jnp.asarray(directions))
+    batched = jax.vmap(jax.vmap(jet, (None, 0)), (0, None))
+    first, second = jax.jit(batched, compiler_options=compiler_options())(points, jnp.asarray(directions))
     return cases, directions, np.asarray(first), np.asarray(second), points
 
 
-def relative(got, want) -> tuple[float, float]:
-    """Find the largest errors of first and second derivatives, over the larger ones where one vanishes."""
+def relative(computed, exact) -> tuple[float, float]:
+    """Return the largest errors of first and second derivatives, relative to a floor if a derivative vanishes."""
 
-    def worst(value, true):
-        size = np.maximum(np.abs(true), 1e-3 * np.abs(true).max(axis=0, keepdims=True) + 1e-6)
-        return float(np.max(np.abs(value - true) / size))
+    def worst(value, exact_value):
+        size = np.maximum(np.abs(exact_value), 1e-3 * np.abs(exact_value).max(axis=0, keepdims=True) + 1e-6)
+        return float(np.max(np.abs(value - exact_value) / size))
 
-    return worst(got[0], want[0]), worst(got[1], want[1])
+    return worst(computed[0], exact[0]), worst(computed[1], exact[1])

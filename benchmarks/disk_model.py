@@ -1,8 +1,8 @@
-"""A model of a disk: what a killed process, or a power cut, may leave of the files of a store.
+"""A model of a disk: the states of a store's files that a killed process, or a power cut, may leave.
 
-A change may be lost until it is flushed. Contents of a file may be lost, or half of them, until the file is flushed. A
+A change may be lost until it is flushed. Contents of a file may be lost, fully or by half, until the file is flushed. A
 change of names (a new file or folder, a rename, an exchange, a removal) may be lost, as a whole, until all its folders
-are flushed, whatever happens to other changes. A killed process loses no change that it made.
+are flushed, independently of other changes. A killed process loses none of its changes.
 
 `recorded` records the calls of the functions in `vijax.runtime.files` that change the disk.
 """
@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from vijax.planes import store, store_folder, store_metadata, tiled_store
+from vijax.maps.storage import store, store_folder, store_metadata, tiled_store
 from vijax.runtime import files
 
 if TYPE_CHECKING:
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 
 CHANGES = ("create", "make_folder", "flush", "rename", "exchange", "remove")
 _MODULES = (files, store, store_folder, store_metadata, tiled_store)
-_RANDOM = 3  # states of every moment in which changes survive at random
-_PARTS = 1.0, 0.5, 0.0  # of the content of a file that is not flushed, survive
+_RANDOM = 3  # states at every moment with randomly surviving changes
+_PARTS = 1.0, 0.5, 0.0  # surviving fractions of the content of an unflushed file
 
 # --- a recording -----------------------------------------------------------------------------------------------------
 
 
 class Inode:
-    """A file with its content, or a folder with its names as they are at the end of the recording."""
+    """A file with its content, or a folder with its names at the end of the recording."""
 
     def __init__(self, content: bytes | None = None) -> None:
         self.content = content
@@ -40,7 +40,7 @@ class Inode:
 
 
 Name = tuple[Inode, str, Inode | None]
-"""A name in a folder, and the inode that has it from then on, if any."""
+"""A name in a folder, and its inode after the change; None if the name is removed."""
 
 
 class Change(NamedTuple):
@@ -55,25 +55,25 @@ class Flush(NamedTuple):
     inodes: list[Inode]
 
 
-class Promise(NamedTuple):
-    """Something that is true from then on: that a tile is done, or a map saved."""
+class Guarantee(NamedTuple):
+    """A guarantee from this moment on: a tile is done, or a map is saved."""
 
     text: str
 
 
 class Recording:
-    """What was done to a folder.
+    """Recorded changes of a folder.
 
     Attributes:
         root: The folder.
         top: Its inode.
-        before: Names that were there before.
-        steps: What was done, in order.
+        before: Names at the beginning.
+        steps: Changes, flushes and guarantees, in order.
     """
 
     def __init__(self, root: Path) -> None:
         self.root, self.top = root, Inode()
-        self.steps: list[Change | Flush | Promise] = []
+        self.steps: list[Change | Flush | Guarantee] = []
         self.before = list(self._names(root, self.top))
         self._guard = threading.Lock()
 
@@ -84,14 +84,14 @@ class Recording:
             if path.is_dir():
                 yield from self._names(path, inner)
 
-    def add(self, name: str, *given: Any) -> None:
-        """Add a call of a function of `files`, or a promise."""
+    def add(self, name: str, *arguments: Any) -> None:
+        """Add a call of a function of `files`, or a guarantee."""
         with self._guard:
-            if name == "promise":
-                self.steps.append(Promise(*given))
+            if name == "guarantee":
+                self.steps.append(Guarantee(*arguments))
             elif name == "flush":
-                self.steps.append(Flush([inode for path in given[0] if (inode := self._find(path))]))
-            elif changed := self._changed(name, *given):
+                self.steps.append(Flush([inode for path in arguments[0] if (inode := self._find(path))]))
+            elif changed := self._changed(name, *arguments):
                 self._apply(changed)
 
     def damage(self, path: Path, content: bytes) -> None:
@@ -99,15 +99,15 @@ class Recording:
         if (inode := self._find(path)) is not None:
             inode.content = content
 
-    def _changed(self, name: str, path: Path, more: Any = None) -> dict[Path, Inode | None]:
-        found = self._find(path)
+    def _changed(self, name: str, path: Path, argument: Any = None) -> dict[Path, Inode | None]:
+        inode = self._find(path)
         if name == "create":
-            return {path: Inode(more)}
+            return {path: Inode(argument)}
         if name == "make_folder":
-            return {} if found else {path: Inode()}
+            return {} if inode else {path: Inode()}
         if name == "remove":
-            return {path: None} if found else {}  # locks of working folders are not recorded
-        return {more: found, path: self._find(more) if name == "exchange" else None}
+            return {path: None} if inode else {}  # locks of working folders are not recorded
+        return {argument: inode, path: self._find(argument) if name == "exchange" else None}
 
     def _find(self, path: Path) -> Inode | None:
         inode: Inode | None = self.top
@@ -147,15 +147,15 @@ def recorded(
     def recorded_call(name: str, first: Any, *more: Any) -> Any:
         before(name)
         first = list(first) if name == "flush" else first
-        found = originals[name](first, *more)
-        if found is not False:  # else the disk cannot exchange names
+        result = originals[name](first, *more)
+        if result is not False:  # else the disk cannot exchange names
             recording.add(name, first, *more)
-        return found
+        return result
 
     for module, name in bound:
         setattr(module, name, partial(recorded_call, name))
     try:
-        with watched(lambda tile: recording.add("promise", str(tile))):
+        with watched(lambda tile: recording.add("guarantee", str(tile))):
             yield recording
     finally:
         for module, name in bound:
@@ -163,19 +163,19 @@ def recorded(
 
 
 @contextmanager
-def watched(tell: Callable[[int], None]) -> Iterator[None]:
-    """Call a function with the number of every tile that is done while the block runs."""
-    write = tiled_store.write
+def watched(notify: Callable[[int], None]) -> Iterator[None]:
+    """Call a function with the number of every tile that is finished while the block runs."""
+    write = tiled_store.write_tile
 
-    def written(tile: tiled_store.StudyTile, found: "Mapping[str, xr.Variable]", seconds: float) -> None:
-        write(tile, found, seconds)
-        tell(tile.number)
+    def write_and_notify(tile: tiled_store.StudyTile, variables: "Mapping[str, xr.Variable]", seconds: float) -> None:
+        write(tile, variables, seconds)
+        notify(tile.number)
 
-    tiled_store.write = written
+    tiled_store.write_tile = write_and_notify
     try:
         yield
     finally:
-        tiled_store.write = write
+        tiled_store.write_tile = write
 
 
 # --- states after a power cut ----------------------------------------------------------------------------------------
@@ -185,60 +185,65 @@ Tree = dict[str, bytes | None]
 
 
 class State(NamedTuple):
-    """What a disk may hold after a power cut, and what was promised before."""
+    """Possible content of a disk after a power cut, and the guarantees before it."""
 
     tree: Tree
-    promised: frozenset[str]
+    guaranteed: frozenset[str]
 
 
 def states(recording: Recording, seed: int = 0) -> list[State]:
-    """Find the states in which a power cut may leave a disk; each once."""
-    draw, found = random.Random(seed), {}
-    for moment, promised in enumerate(_promises(recording)):
+    """Return the possible states of a disk after a power cut, each once."""
+    draw, by_content = random.Random(seed), {}
+    for moment, guaranteed in enumerate(_guarantees(recording)):
         for tree in _trees(recording, moment, draw):
-            found[tuple(sorted(tree.items())), promised] = State(tree, promised)
-    return list(found.values())
+            by_content[tuple(sorted(tree.items())), guaranteed] = State(tree, guaranteed)
+    return list(by_content.values())
 
 
-def some_states(recording: Recording, most: int, seed: int = 0) -> list[State]:
-    """Draw so many of these states, for each set of promises as many."""
+def random_states(recording: Recording, count: int, seed: int = 0) -> list[State]:
+    """Draw a number of these states, equally many for each set of guarantees."""
     draw, groups = random.Random(seed), dict[frozenset[str], list[int]]()
-    for moment, promised in enumerate(_promises(recording)):
-        groups.setdefault(promised, []).append(moment)
-    turns = itertools.islice(itertools.cycle(groups.items()), most)
-    return [State(draw.choice(list(_trees(recording, draw.choice(some), draw))), given) for given, some in turns]
+    for moment, guaranteed in enumerate(_guarantees(recording)):
+        groups.setdefault(guaranteed, []).append(moment)
+    turns = itertools.islice(itertools.cycle(groups.items()), count)
+    return [
+        State(draw.choice(list(_trees(recording, draw.choice(moments), draw))), guarantees)
+        for guarantees, moments in turns
+    ]
 
 
-def _promises(recording: Recording) -> list[frozenset[str]]:
-    """Find what is promised before every step, and at the end."""
-    found = [frozenset[str]()]
+def _guarantees(recording: Recording) -> list[frozenset[str]]:
+    """Return the guarantees before every step, and at the end."""
+    guaranteed = [frozenset[str]()]
     for step in recording.steps:
-        found.append(found[-1] | {step.text} if isinstance(step, Promise) else found[-1])
-    return found
+        guaranteed.append(guaranteed[-1] | {step.text} if isinstance(step, Guarantee) else guaranteed[-1])
+    return guaranteed
 
 
 def last(recording: Recording) -> Tree:
-    """Find what a disk holds at the end of a recording."""
+    """Return the content of a disk at the end of a recording."""
     changes = [step for step in recording.steps if isinstance(step, Change)]
     return _tree(recording, changes, set(), 1.0)
 
 
 def random_state(recording: Recording, draw: random.Random) -> Tree:
-    """Draw a state in which a power cut may leave a disk after the last step of a recording."""
+    """Draw a possible state of a disk after a power cut at the end of a recording."""
     changes, loose, flushed = _unflushed(recording, len(recording.steps))
-    return _tree(recording, _survivors(changes, loose, draw.choice(_kept(loose, draw))), flushed, draw.choice(_PARTS))
+    return _tree(
+        recording, _survivors(changes, loose, draw.choice(_surviving_sets(loose, draw))), flushed, draw.choice(_PARTS)
+    )
 
 
 def _trees(recording: Recording, moment: int, draw: random.Random) -> Iterator[Tree]:
-    """Find what a disk may hold after a power cut before a step."""
+    """Yield the possible contents of a disk after a power cut before a step."""
     changes, loose, flushed = _unflushed(recording, moment)
-    for some in _kept(loose, draw):
+    for surviving in _surviving_sets(loose, draw):
         for part in _PARTS:
-            yield _tree(recording, _survivors(changes, loose, some), flushed, part)
+            yield _tree(recording, _survivors(changes, loose, surviving), flushed, part)
 
 
 def _unflushed(recording: Recording, moment: int) -> tuple[dict[int, Change], list[int], set[Inode]]:
-    """Find the changes before a step by their numbers, those among them that are not flushed, and flushed inodes."""
+    """Return the changes before a step by number, the numbers of unflushed ones, and the flushed inodes."""
     steps = recording.steps[:moment]
     flushed = {inode: at for at, step in enumerate(steps) if isinstance(step, Flush) for inode in step.inodes}
     changes = {at: step for at, step in enumerate(steps) if isinstance(step, Change)}
@@ -246,19 +251,19 @@ def _unflushed(recording: Recording, moment: int) -> tuple[dict[int, Change], li
     return changes, loose, set(flushed)
 
 
-def _kept(loose: list[int], draw: random.Random) -> list[set[int]]:
-    """List sets of changes that may survive, of those that are not flushed."""
-    kept = [set(loose[:number]) for number in range(len(loose) + 1)]
-    kept += [set(loose) - {one} for one in loose] + [{one} for one in loose]
-    return kept + [{one for one in loose if draw.random() < 0.5} for _ in range(_RANDOM)]
+def _surviving_sets(loose: list[int], draw: random.Random) -> list[set[int]]:
+    """Return sets of unflushed changes that may survive."""
+    sets = [set(loose[:length]) for length in range(len(loose) + 1)]
+    sets += [set(loose) - {number} for number in loose] + [{number} for number in loose]
+    return sets + [{number for number in loose if draw.random() < 0.5} for _ in range(_RANDOM)]
 
 
-def _survivors(changes: dict[int, Change], loose: list[int], kept: set[int]) -> list[Change]:
-    return [change for at, change in changes.items() if at in kept or at not in loose]
+def _survivors(changes: dict[int, Change], loose: list[int], surviving: set[int]) -> list[Change]:
+    return [change for at, change in changes.items() if at in surviving or at not in loose]
 
 
 def _tree(recording: Recording, changes: list[Change], flushed: set[Inode], part: float) -> Tree:
-    """Apply changes to what was there; this part of contents is left where they were not flushed."""
+    """Apply changes to the initial content; this fraction of every unflushed content survives."""
     names: dict[Inode, dict[str, Inode]] = {}
     for folder, name, inode in [*recording.before, *(name for change in changes for name in change.names)]:
         inner = names.setdefault(folder, {})
@@ -266,17 +271,19 @@ def _tree(recording: Recording, changes: list[Change], flushed: set[Inode], part
             inner.pop(name, None)
         else:
             inner[name] = inode
-    whole = flushed | {inode for _, _, inode in recording.before if inode is not None}
-    found: Tree = {}
+    complete = flushed | {inode for _, _, inode in recording.before if inode is not None}
+    tree: Tree = {}
 
-    def walk(folder: Inode, within: str) -> None:
+    def add_folder(folder: Inode, within: str) -> None:
         for name, inode in names.get(folder, {}).items():
             content = inode.content
-            found[within + name] = content if content is None or inode in whole else content[: int(part * len(content))]
-            walk(inode, f"{within}{name}/")
+            tree[within + name] = (
+                content if content is None or inode in complete else content[: int(part * len(content))]
+            )
+            add_folder(inode, f"{within}{name}/")
 
-    walk(recording.top, "")
-    return found
+    add_folder(recording.top, "")
+    return tree
 
 
 def lay_out(tree: Tree, folder: Path) -> None:

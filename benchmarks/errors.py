@@ -1,17 +1,16 @@
-"""Do the standard errors hold? Averages against runs of 16 times as many periods, quantiles and slopes against others.
+"""Are standard errors correct? Averages against runs with 16 times the periods, quantiles and slopes against others.
 
-    python benchmarks/errors.py                  # all parts; rows are kept in rows/errors.csv
+    python benchmarks/errors.py                  # all parts; rows are stored in rows/errors.csv
     python benchmarks/errors.py --only sweep     # one part: sweep, response, average
     python benchmarks/errors.py --quick          # fewer cells and runs: does it run?
 
-Every row compares differences with their combined standard errors: z is the difference over them. Its root mean square
-is 1 and 0.3 % of it lie beyond 3 where errors hold and are normal.
+Every row compares differences with their combined standard errors: z is the ratio. If errors are correct and normal,
+the root mean square of z is 1 and 0.3 % of |z| exceed 3.
 
 sweep: `P_stderr` of aperiodic cells, d log-uniform from 0.03 to 10, kappa from 3 to 400, r from 0.2 to 0.95, level and
-inclined (gamma up to 0.2). P of the default horizon is set against the same motion over 16 times as many periods, whose
-window begins after the first one has ended. Cells that have lost the status `ok` have a row of their own. So have
-cells whose chaos has ended by the end of the longer run, on an orbit or in motions that hardly touch a wall: they have
-no average to compare with.
+inclined (gamma up to 0.2). P of the default horizon is compared with the motion over 16 times as many periods, in
+a window after the first one. Cells without the status `ok` have their own row. So do cells that leave chaos before the
+end of the longer run, for an orbit or for motions with rare impacts: no average exists for comparison.
 response: errors of quantiles, 200 responses with other seeds of the noise, against the quantile of all their impacts.
 average: errors of slopes, 40 seeds of random balls and the default lattice against the mean over the seeds.
 """
@@ -29,19 +28,19 @@ import numpy as np
 import vijax
 from benchmarks import tables
 from benchmarks.averages import chaotic_cells
-from vijax.batch.simulate import Scale, summarise
-from vijax.batch.summary import Summary
+from vijax.maps.sweep_settings import SPEED
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
-from vijax.model.variables import value_of
-from vijax.planes.sweep_settings import SPEED
+from vijax.model.tuned_quantities import value_of
+from vijax.simulation.simulate import Scale, summarise
+from vijax.simulation.summary import Summary
 
 SEED = 1
 CELLS, QUICK_CELLS = 6000, 600  # drawn, level and inclined each; two in five are aperiodic
 LONGER = 16
-NEUTRAL = 2 / np.pi**2  # gap above which a level ball may fly for ever
-RARE, SLOW = 0.1, 0.025  # impacts a period, and d times that, below which chaos has ended; see `vijax.survival`
+NEUTRAL = 2 / np.pi**2  # gap above which a level motion without impacts exists
+RARE, SLOW = 0.1, 0.025  # impacts a period, and d times that rate, below which chaos has ended; see `vijax.survival`
 RESPONSES, QUICK_RESPONSES = 200, 20
 SEEDS, QUICK_SEEDS, DEVICES = 40, 6, 8
 # d, kappa, r, level and rate of the noise.
@@ -55,15 +54,15 @@ SYSTEMS = {
 
 
 class Row(NamedTuple):
-    """How well some standard errors hold.
+    """Accuracy of some standard errors.
 
     Attributes:
-        part, scene: What was compared, and where.
-        quantity: Of what the error is.
-        number: How many differences.
+        part, scene: Compared quantity and system.
+        quantity: Quantity with the standard error.
+        number: Number of differences.
         rms: Root mean square of z.
-        beyond_2, beyond_3: Shares of |z| above.
-        relative: The median of the error over the value.
+        above_2, above_3: Fractions of |z| above 2 and 3.
+        relative: Median of the relative error.
     """
 
     part: str
@@ -71,15 +70,15 @@ class Row(NamedTuple):
     quantity: str
     number: int
     rms: float
-    beyond_2: float
-    beyond_3: float
+    above_2: float
+    above_3: float
     relative: float
 
 
 def row(part: str, scene: str, quantity: str, z: np.ndarray, relative: np.ndarray) -> Row:
-    """Sum up differences over their standard errors; a NaN counts as beyond 3."""
-    off = np.where(np.isnan(z), np.inf, np.abs(z))
-    numbers = [np.sqrt(np.nanmean(z * z)), (off > 2).mean(), (off > 3).mean(), np.nanmedian(relative)]
+    """Summarise differences over their standard errors; NaN counts as above 3."""
+    absolute_z = np.where(np.isnan(z), np.inf, np.abs(z))
+    numbers = [np.sqrt(np.nanmean(z * z)), (absolute_z > 2).mean(), (absolute_z > 3).mean(), np.nanmedian(relative)]
     return Row(part, scene, quantity, z.size, *(float(x) for x in (numbers if z.size else [np.nan] * 4)))
 
 
@@ -93,8 +92,8 @@ class Cells(NamedTuple):
     u: np.ndarray
     v: np.ndarray
 
-    def some(self, index: np.ndarray) -> "Cells":
-        """Return those with the given indices."""
+    def subset(self, index: np.ndarray) -> "Cells":
+        """Return the cells with the given indices."""
         return jax.tree.map(lambda x: x[index], self)
 
 
@@ -107,16 +106,16 @@ def drawn(count: int, tilt: float) -> Cells:
     return Cells(ImpactPair(*map(jnp.asarray, (d, kappa, r, gamma))), u, v)
 
 
-def run(cells: Cells, periods: int, **told: Any) -> Summary:
-    """Run cells, each until its attractor is certain or its average is found unless told otherwise."""
-    device, one = Harvester(), jnp.ones(cells.u.size)
-    scale = Scale(one * device.length_unit, one * device.speed_unit, jnp.ones(1), jnp.ones(1))
+def run(cells: Cells, periods: int, **print_rows: Any) -> Summary:
+    """Run cells, by default until the attractor is certain or the average is converged."""
+    device, unit = Harvester(), jnp.ones(cells.u.size)
+    scale = Scale(unit * device.length_unit, unit * device.speed_unit, jnp.ones(1), jnp.ones(1))
     u, v = jnp.asarray(cells.u), jnp.asarray(cells.v)
-    return summarise(cells.pair, u, v, scale, device, periods=periods, outputs=frozenset({"P"}), **told)
+    return summarise(cells.pair, u, v, scale, device, periods=periods, outputs=frozenset({"P"}), **print_rows)
 
 
 class Longer(NamedTuple):
-    """What became of motions in runs that are longer: P with its error, and whether chaos had ended."""
+    """Results of longer runs: P with its error, and whether chaos has ended."""
 
     P: np.ndarray
     P_stderr: np.ndarray
@@ -124,64 +123,64 @@ class Longer(NamedTuple):
 
 
 def longer(cells: Cells, periods: int) -> Longer:
-    """Run cells for 16 times as many periods, and watch what follows."""
-    found = run(cells, LONGER * periods)
+    """Run cells for 16 times as many periods, and a window after them."""
+    long_run = run(cells, LONGER * periods)
     after = run(cells, max(4 * periods, 1600), until="window", transient=LONGER * periods)
     rate = np.asarray(after.impacts_per_period)
-    creeps = (rate < RARE) & (rate * np.asarray(cells.pair.d) < SLOW)
-    P, error = (np.asarray(x)[:, 0] for x in (found.P, found.P_stderr))
-    return Longer(P, error, (found.period != 0) | creeps)
+    rare_impacts = (rate < RARE) & (rate * np.asarray(cells.pair.d) < SLOW)
+    P, error = (np.asarray(x)[:, 0] for x in (long_run.P, long_run.P_stderr))
+    return Longer(P, error, (long_run.period != 0) | rare_impacts)
 
 
 def sweep(quick: bool) -> Iterator[Row]:
-    """Compare P of aperiodic cells with that of longer runs of the same motion."""
+    """Compare P of aperiodic cells with P of longer runs of the same motion."""
     for scene, tilt in (("level", 0.0), ("gamma to 0.2", 0.2)):
         cells = drawn(QUICK_CELLS if quick else CELLS, tilt)
         first = run(cells, 400)
         index = np.flatnonzero(first.period == 0)
         horizon = np.round(np.asarray(first.periods_run)[index])
         P, error, status = (np.asarray(x)[index].ravel() for x in (first.P, first.P_stderr, first.status))
-        far, far_error, ended = np.full((3, index.size), np.nan)
+        longer_P, longer_error, ended = np.full((3, index.size), np.nan)
         for periods in np.unique(horizon):
-            here = np.flatnonzero(horizon == periods)
-            far[here], far_error[here], ended[here] = longer(cells.some(index[here]), int(periods))
-        z, relative, d = (P - far) / np.hypot(error, far_error), error / P, np.asarray(cells.pair.d)[index]
-        few, goes_on = status == Status.FEW_IMPACTS, ended == 0
-        ok = ~few & goes_on
+            rows = np.flatnonzero(horizon == periods)
+            longer_P[rows], longer_error[rows], ended[rows] = longer(cells.subset(index[rows]), int(periods))
+        z, relative, d = (P - longer_P) / np.hypot(error, longer_error), error / P, np.asarray(cells.pair.d)[index]
+        few_impacts, continues = status == Status.FEW_IMPACTS, ended == 0
+        ok = ~few_impacts & continues
         groups = {
             "all": ok,
             "d below 2/pi^2": ok & (d < NEUTRAL),
             "d from 2/pi^2 to 1": ok & (d > NEUTRAL) & (d < 1),
             "d above 1": ok & (d > 1),
             "run on": ok & (horizon > 400),
-            "status few_impacts": few & goes_on,
-            "chaos that ends later": ~few & ~goes_on,
+            "status few_impacts": few_impacts & continues,
+            "chaos that ends later": ~few_impacts & ~continues,
         }
-        for name, some in groups.items():
-            yield row("sweep", f"{scene}, {name}", "P", z[some], relative[some])
+        for name, selected in groups.items():
+            yield row("sweep", f"{scene}, {name}", "P", z[selected], relative[selected])
 
 
 # --- quantiles of a response ------------------------------------------------------------------------------------------
 
 
 def device(d: float, kappa: float, r: float) -> Harvester:
-    """Make a device of the given gap, stiffness and restitution."""
-    one = Harvester(omega=5 * np.pi)
-    return Harvester(omega=5 * np.pi, s=d * float(one.length_unit), omega0=5 * kappa, r=r)
+    """Return a device with a gap, stiffness and restitution."""
+    unit_device = Harvester(omega=5 * np.pi)
+    return Harvester(omega=5 * np.pi, s=d * float(unit_device.length_unit), omega0=5 * kappa, r=r)
 
 
 def response(quick: bool) -> Iterator[Row]:
     """Compare quantiles of the speed and depth of impacts with the mean over responses to other noise."""
     for scene, (d, kappa, r, level, rate) in SYSTEMS.items():
-        of = device(d, kappa, r)
+        system = device(d, kappa, r)
         seeds = range(1, 1 + (QUICK_RESPONSES if quick else RESPONSES))
         noisy = (vijax.Harmonics() + vijax.Noise(level, rate, seed) for seed in seeds)
-        found = [vijax.response(of, excitation, attractors=False, periods=200) for excitation in noisy]
+        responses = [vijax.response(system, excitation, attractors=False, periods=200) for excitation in noisy]
         for name in ("speed", "penetration"):
             values, errors = (
-                np.stack([one[f"{name}_quantile{kind}"].values for one in found]) for kind in ("", "_stderr")
+                np.stack([single[f"{name}_quantile{kind}"].values for single in responses]) for kind in ("", "_stderr")
             )
-            for quantile, value, error in zip(found[0]["quantile"].values, values.T, errors.T, strict=True):
+            for quantile, value, error in zip(responses[0]["quantile"].values, values.T, errors.T, strict=True):
                 z = (value - value.mean()) / error
                 yield row("response", scene, f"{quantile:g} quantile of {name}", z, error / value)
 
@@ -196,18 +195,18 @@ def average(quick: bool) -> Iterator[Row]:
     random: dict[str, list[np.ndarray]] = {name: [] for name in names}
     lattice: dict[str, list[float]] = {name: [] for name in names}
     size: dict[str, list[np.ndarray]] = {name: [] for name in names}
-    for of in smooth_devices(2 if quick else DEVICES):
-        found = [vijax.average(of, seed=seed) for seed in range(count)]
-        even = vijax.average(of)
+    for system in smooth_devices(2 if quick else DEVICES):
+        averages = [vijax.average(system, seed=seed) for seed in range(count)]
+        lattice_average = vijax.average(system)
         for name in names:
-            slopes = np.array([float(getattr(one.by_pair, name)) for one in found])
-            errors = np.array([float(getattr(one.by_pair_stderr, name)) for one in found])
-            # Each is a part of the mean.
+            slopes = np.array([float(getattr(single.by_pair, name)) for single in averages])
+            errors = np.array([float(getattr(single.by_pair_stderr, name)) for single in averages])
+            # Each seed is part of the mean, so its deviation is too small by sqrt((count - 1)/count).
             random[name].append((slopes - slopes.mean()) / errors * np.sqrt(count / (count - 1)))
-            own = float(getattr(even.by_pair_stderr, name))
-            spread = np.hypot(own, slopes.std(ddof=1) / np.sqrt(count))
-            lattice[name].append((float(getattr(even.by_pair, name)) - slopes.mean()) / spread)
-            size[name].append(errors * float(value_of(of, name) / even.P))
+            lattice_error = float(getattr(lattice_average.by_pair_stderr, name))
+            spread = np.hypot(lattice_error, slopes.std(ddof=1) / np.sqrt(count))
+            lattice[name].append((float(getattr(lattice_average.by_pair, name)) - slopes.mean()) / spread)
+            size[name].append(errors * float(value_of(system, name) / lattice_average.P))
     for name in names:
         relative = np.concatenate(size[name])
         yield row("average", "random balls", f"dlnP/dln {name}", np.concatenate(random[name]), relative)
@@ -215,10 +214,10 @@ def average(quick: bool) -> Iterator[Row]:
 
 
 def smooth_devices(count: int) -> Iterator[Harvester]:
-    """Find chaotic devices whose averages are smooth."""
-    for of in chaotic_cells(100 * count):
-        if count and bool(vijax.average(of).smooth):
-            yield of
+    """Yield chaotic devices with smooth averages."""
+    for system in chaotic_cells(100 * count):
+        if count and bool(vijax.average(system).smooth):
+            yield system
             count -= 1
         if not count:
             return
@@ -227,28 +226,28 @@ def smooth_devices(count: int) -> Iterator[Harvester]:
 PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {"sweep": sweep, "response": response, "average": average}
 
 
-def told(rows: Iterator[Row]) -> Iterator[Row]:
-    """Print rows as they come."""
-    for one in rows:
+def print_rows(rows: Iterator[Row]) -> Iterator[Row]:
+    """Print rows as they are measured."""
+    for item in rows:
         print(
-            f"{one.part + ', ' + one.scene + ', ' + one.quantity:<72} {one.number:5d}  rms z {one.rms:.2f}, "
-            f"beyond 2 {one.beyond_2:.1%}, beyond 3 {one.beyond_3:.1%}, relative error {one.relative:.2g}",
+            f"{item.part + ', ' + item.scene + ', ' + item.quantity:<72} {item.number:5d}  rms z {item.rms:.2f}, "
+            f"above 2 {item.above_2:.1%}, above 3 {item.above_3:.1%}, relative error {item.relative:.2g}",
             flush=True,
         )
-        yield one
+        yield item
 
 
 def main() -> None:
-    """Measure, print, keep the rows; of parts that are not measured the rows that are there."""
+    """Measure the selected parts, print and store their rows; stored rows of other parts remain."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only", choices=PARTS, nargs="+", default=list(PARTS))
     parser.add_argument("--quick", action="store_true", help="fewer cells and runs")
     parser.add_argument("--rows", type=Path, default=tables.ROWS, help="folder for the rows")
-    given = parser.parse_args()
-    path = given.rows / ("errors_quick.csv" if given.quick else "errors.csv")
-    kept = [one for one in tables.read(path) if one.part not in given.only]
-    measured = (one for part in given.only for one in told(partial(PARTS[part], given.quick)()))
-    tables.write(path, Row._fields, measured, kept)
+    options = parser.parse_args()
+    path = options.rows / ("errors_quick.csv" if options.quick else "errors.csv")
+    other_rows = [item for item in tables.read(path) if item.part not in options.only]
+    measured = (item for part in options.only for item in print_rows(partial(PARTS[part], options.quick)()))
+    tables.write(path, Row._fields, measured, other_rows)
 
 
 if __name__ == "__main__":

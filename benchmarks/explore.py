@@ -1,11 +1,11 @@
-"""How long is the way from a click on a map to the motion on the screen, and what else does the page of a map cost?
+"""How much time passes from a click on a map to the motion on the screen, and what else does the page cost?
 
     python -m benchmarks.explore                        # every figure: a few minutes
     python -m benchmarks.explore --clicks 100 --long 0  # clicks alone
     python -m benchmarks.explore --picture page.png     # the picture of README
 
-Measured in Chromium, from the event of the pointer to the second frame after the answer, over random cells of the
-default map, on a server that is warm. Needs the extra `test`, and Chromium.
+Measured in Chromium, from the pointer event to the second frame after the answer, over random cells of the default map,
+on a server with compiled programs. Needs the extra `test`, and Chromium.
 """
 
 import argparse
@@ -22,17 +22,17 @@ from typing import Any
 import numpy as np
 
 import vijax
-from vijax.explorer.motion import MOST_IMPACTS
+from vijax.explorer.analyses.motion import MOST_IMPACTS
 from vijax.model.label import label
 
 SIDES = (64, 64)  # of the default map
 D, KAPPA = np.linspace(0.05, 0.3, SIDES[0]), np.geomspace(3.0, 400.0, SIDES[1])
-_COMPARED = 50  # cells whose numbers are compared with the library's
-_ON_DEMAND = ((56, 56), (40, 40), (60, 30), (36, 50), (50, 20))  # cells whose basins and branches are timed
-_WAIT = 600_000  # milliseconds: with nothing kept all programs are compiled first
-_FRESH = 60  # clicks before memory is looked at: what is compiled at first is no growth
+_COMPARED = 50  # cells for the comparison with the library's numbers
+_ON_DEMAND = ((56, 56), (40, 40), (60, 30), (36, 50), (50, 20))  # cells for the timing of basins and branches
+_WAIT = 600_000  # milliseconds; with an empty cache all programs are compiled first
+_FRESH = 60  # clicks before the first memory measurement; compilation at the start is not growth
 
-# From the begin of the next click to the second frame after its answer, in milliseconds, as `took`.
+# Measures from the start of the next click to the second frame after its answer, in milliseconds, as `took`.
 ARM = """() => {
     const number = vijax.number + 1;
     window.took = null;
@@ -52,8 +52,8 @@ FRAME = """() => {
 
 
 @contextmanager
-def served() -> Iterator[tuple[str, int]]:
-    """Serve the default map; give the address of its page and the number of the process."""
+def default_map_server() -> Iterator[tuple[str, int]]:
+    """Serve the default map; yield the address of its page and the number of the process."""
     line = [sys.executable, "-m", "vijax", "explore", "--no-browser", "--port", "0"]
     with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -64,8 +64,8 @@ def served() -> Iterator[tuple[str, int]]:
 
 
 @contextmanager
-def opened(address: str, width: int = 1280, height: int = 800) -> Iterator[Any]:
-    """Open a page in Chromium and wait until all is compiled."""
+def page_of(address: str, width: int = 1280, height: int = 800) -> Iterator[Any]:
+    """Open a page in Chromium, and wait until everything is compiled."""
     from playwright.sync_api import sync_playwright
 
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -81,24 +81,24 @@ def opened(address: str, width: int = 1280, height: int = 800) -> Iterator[Any]:
 
 
 def settle(page: Any) -> None:
-    """Wait until the first motion is shown and nothing is compiled any more."""
+    """Wait until the first motion is shown and all programs are compiled."""
     page.wait_for_function("document.body.dataset.shown !== undefined", timeout=_WAIT)
-    page.wait_for_function("document.getElementById('warmth').hidden", timeout=_WAIT)
+    page.wait_for_function("document.getElementById('compilation').hidden", timeout=_WAIT)
 
 
 def memory(process: int) -> float:
-    """Read what a process holds, in MB."""
-    told = Path(f"/proc/{process}/status").read_text()
-    (kilobytes,) = re.findall(r"^VmRSS:\s+(\d+) kB", told, re.M)
+    """Return the memory of a process in MB."""
+    status = Path(f"/proc/{process}/status").read_text()
+    (kilobytes,) = re.findall(r"^VmRSS:\s+(\d+) kB", status, re.M)
     return int(kilobytes) / 1024
 
 
 def picks(count: int, seed: int) -> np.ndarray:
-    """Draw cells."""
+    """Draw random cells."""
     return np.random.default_rng(seed).integers(0, SIDES, (count, 2))
 
 
-def shown(page: Any) -> dict[str, str]:
+def page_numbers(page: Any) -> dict[str, str]:
     """Read the numbers of the picked cell from the page."""
     rows = page.evaluate(
         "[...document.querySelectorAll('#rows div')].map((row) => [...row.children].map((x) => x.textContent))"
@@ -107,28 +107,28 @@ def shown(page: Any) -> dict[str, str]:
 
 
 def expected(column: int, row: int) -> dict[str, str]:
-    """Give the same numbers by the functions of vijax alone, to as many digits."""
+    """Return the same numbers by vijax alone, with the same digits."""
     d, kappa = float(D[column]), float(KAPPA[row])
-    found = vijax.sweep(d=d, kappa=kappa)
-    word = str(label(*(found[name].values for name in ("period", "impacts_left", "impacts_right", "status"))))
-    error = float(found["P_stderr"])
-    power = f"{float(found['P']):.6g} J per half period" + (f" \u00b1 {error:.2g} J" if error > 0 else "")
-    pair, start = vijax.impact_pair(d, kappa, 0.5), (float(found["u0"]), float(found["v0"]))
+    dataset = vijax.sweep(d=d, kappa=kappa)
+    cell_label = str(label(*(dataset[name].values for name in ("period", "impacts_left", "impacts_right", "status"))))
+    error = float(dataset["P_stderr"])
+    power = f"{float(dataset['P']):.6g} J per half period" + (f" \u00b1 {error:.2g} J" if error > 0 else "")
+    pair, start = vijax.impact_pair(d, kappa, 0.5), (float(dataset["u0"]), float(dataset["v0"]))
     end = vijax.trajectory(pair, *start, periods=400).states
-    multipliers, period = "no orbit", int(found["period"])
-    impacts = int(found["impacts_left"] + found["impacts_right"])
+    multipliers, period = "no orbit", int(dataset["period"])
+    impacts = int(dataset["impacts_left"] + dataset["impacts_right"])
     if period > 0 and impacts > MOST_IMPACTS:
         multipliers = f"not solved for, {impacts} impacts"
     elif period > 0:
         orbit = vijax.orbits_from_states(pair, end.u[-1], end.v[-1], period=period)
-        if int(orbit.status[0]) == 0 and str(vijax.orbit_labels(orbit)[0]) == word:
+        if int(orbit.status[0]) == 0 and str(vijax.orbit_labels(orbit)[0]) == cell_label:
             values = np.asarray(orbit.multipliers)[0]
             multipliers = ", ".join(f"{x.real:.6g}" + (f"{x.imag:+.6g}i" if x.imag else "") for x in values)
-    return {"label": word, "P": power, "multipliers": multipliers}
+    return {"label": cell_label, "P": power, "multipliers": multipliers}
 
 
 def click(page: Any, pick: Any) -> float:
-    """Click on a cell, and give the milliseconds until its motion is on the screen; 0 where it is picked already."""
+    """Click on a cell; return the milliseconds until its motion is on the screen, 0 for the current cell."""
     if page.evaluate("new URLSearchParams(location.search).get('cell')") == f"{pick[0]},{pick[1]}":
         return 0.0
     page.evaluate("scrollTo(0, 0)")
@@ -140,7 +140,7 @@ def click(page: Any, pick: Any) -> float:
 
 
 def seconds(page: Any, name: str) -> float:
-    """Measure how long a panel takes from the button to its answer."""
+    """Measure the seconds of a panel from its button to its answer."""
     before = time.perf_counter()
     page.click(f'.compute[data-name="{name}"]')
     page.wait_for_function(
@@ -150,39 +150,42 @@ def seconds(page: Any, name: str) -> float:
 
 
 def measure(clicks: int, long: int) -> Iterator[str]:
-    """Measure all of it, and say each figure in a line."""
-    with served() as (address, process), opened(address) as page:
+    """Measure all figures, one line each."""
+    with default_map_server() as (address, process), page_of(address) as page:
         for pick in picks(_FRESH, 1):
             click(page, pick)
-        took = [click(page, pick) for pick in picks(clicks, 2)]
-        middle, most = np.percentile(took, [50, 95])
-        yield f"click to motion on the screen, {clicks} cells: median {middle:.0f} ms, 95 % within {most:.0f} ms"
-        differ = 0
+        times = [click(page, pick) for pick in picks(clicks, 2)]
+        median, upper = np.percentile(times, [50, 95])
+        yield f"click to motion on the screen, {clicks} cells: median {median:.0f} ms, 95 % within {upper:.0f} ms"
+        different = 0
         for pick in picks(_COMPARED, 3):
             click(page, pick)
-            own, there = expected(*pick), shown(page)
-            differ += any(there[name] != text for name, text in own.items())
-        yield f"cells whose label, P or multipliers differ from the library's: {differ} of {_COMPARED}"
+            library_numbers, page_values = expected(*pick), page_numbers(page)
+            different += any(page_values[name] != text for name, text in library_numbers.items())
+        yield f"cells whose label, P or multipliers differ from the library's: {different} of {_COMPARED}"
         for name in ("basin", "branch"):
-            spent = []
+            durations = []
             for pick in _ON_DEMAND:
                 click(page, pick)
-                spent.append(seconds(page, name))
-            yield f"{name}, {len(spent)} cells: median {np.median(spent):.2f} s, at most {max(spent):.2f} s"
+                durations.append(seconds(page, name))
+            yield f"{name}, {len(durations)} cells: median {np.median(durations):.2f} s, at most {max(durations):.2f} s"
         before = time.perf_counter()
         page.goto(address, timeout=_WAIT)
         page.wait_for_function("document.body.dataset.shown !== undefined", timeout=_WAIT)
         yield f"load until the first motion is shown, all compiled: {time.perf_counter() - before:.2f} s"
         if long:
-            begun = memory(process)
+            memory_before = memory(process)
             for pick in picks(long, 4):
                 click(page, pick)
-            yield f"memory of the server over {long} clicks: {begun:.0f} to {memory(process):.0f} MB"
+            yield f"memory of the server over {long} clicks: {memory_before:.0f} to {memory(process):.0f} MB"
 
 
 def picture(path: str, width: int, height: int) -> None:
-    """Save a picture of the page, its basins and its branch computed."""
-    with served() as (address, _), opened(f"{address}?variable=P&cell=40%2C46&along=kappa", width, height) as page:
+    """Save a picture of the page with computed basins and branch."""
+    with (
+        default_map_server() as (address, _),
+        page_of(f"{address}?variable=P&cell=40%2C46&along=kappa", width, height) as page,
+    ):
         for name in ("basin", "branch"):
             seconds(page, name)
         page.evaluate("document.activeElement.blur(); scrollTo(0, 0)")
@@ -191,18 +194,18 @@ def picture(path: str, width: int, height: int) -> None:
 
 
 def main() -> int:
-    """Measure or draw what the command line asks for."""
+    """Measure or draw, as the command line selects."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--clicks", type=int, default=100, help="cells that are clicked on [100]")
     parser.add_argument("--long", type=int, default=1000, help="clicks over which memory is looked at [1000]")
     parser.add_argument("--picture", metavar="FILE.png", help="draw the page instead")
     parser.add_argument("--size", default="1280x800", metavar="WxH", help="of the picture [1280x800]")
-    given = parser.parse_args()
-    if given.picture:
-        width, _, height = given.size.partition("x")
-        picture(given.picture, int(width), int(height))
+    options = parser.parse_args()
+    if options.picture:
+        width, _, height = options.size.partition("x")
+        picture(options.picture, int(width), int(height))
         return 0
-    for line in measure(given.clicks, given.long):
+    for line in measure(options.clicks, options.long):
         print(line, flush=True)
     return 0
 

@@ -1,14 +1,14 @@
-"""Where do the usual methods fail on this problem, by how much, and what does vijax do about it?
+"""Where do the usual methods fail on this problem, by how much, and how does vijax avoid it?
 
     python benchmarks/failures.py                     # the whole table
     python benchmarks/failures.py --quick             # small settings, under a minute
     python benchmarks/failures.py --only grazing      # one scene
     python benchmarks/failures.py --plot stability.png  # the stability map as a picture
 
-One block a scene: what goes wrong, each figure by the usual method and by vijax, and the answer. The test of a scene
-has its name: tests/benchmarks/test_failures.py::test_stability asserts of the quick figures that the usual method fails
-there and that vijax does not. Figures are measured by this command and by nothing else; timings are not among them.
-Printout for two scenes, usual method and vijax side by side:
+One block a scene: the failure, each figure by the usual method and by vijax, and vijax' solution. The test of a scene
+has the scene's name: tests/benchmarks/test_failures.py::test_stability asserts on the quick figures that the usual
+method fails and vijax does not. Figures are measured by this command alone; timings are not among them. Printout for
+two scenes, usual method and vijax side by side:
 
     gradients: differentiating through `where` drops the jump: the error stays at any step
         error of the gradient: 500 steps through `where`, 60 of Tsit5 located           1.08   0.00316
@@ -38,13 +38,13 @@ import numpy as np
 import vijax
 from benchmarks import charts, naive, tables
 from benchmarks.peers import rk4
-from vijax.batch.run_records import Trajectory
-from vijax.engine import exact
-from vijax.engine.ode import Ode
+from vijax.impact.exact import exact_step
+from vijax.impact.ode.ode import Ode
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State
-from vijax.model.restitution import damping_ratio
+from vijax.model.walls.restitution import damping_ratio
+from vijax.simulation.run_records import Trajectory
 
 HERE = Path(__file__).parent
 REFERENCE = HERE.parent / "tests" / "data" / "plane_cells.json"
@@ -52,25 +52,25 @@ NONE = float("nan")
 
 R, U0, V0 = 0.5, 0.0, 0.4
 D_REGULAR = 0.2
-LANES, PERIODS, ROOM = 64, 400, 1500  # the one shape in which long exact runs are compiled
-SHORT, SHORT_ROOM = 3, 120  # and that of short ones that are differentiated
+LANES, PERIODS, CAPACITY = 64, 400, 1500  # the single shape for which long exact runs are compiled
+SHORT, SHORT_CAPACITY = 3, 120  # the shape of short runs that are differentiated
 LONGEST_PERIOD = 32
-RECURRENCE = {"float64": 1e-6, "float32": 1e-3}  # how closely a stroboscopic state must recur
+RECURRENCE = {"float64": 1e-6, "float32": 1e-3}  # tolerance of a recurrence of the stroboscopic state
 SEED = 7
-D_SLOW, SLOW_WINDOW = 0.2 / 9, (20, 50)  # s 0.2 at A 1, omega pi/3; periods that are counted
+D_SLOW, SLOW_WINDOW = 0.2 / 9, (20, 50)  # s 0.2 at A 1, omega pi/3; first and last counted period
 D_CHAOS = 0.12
 
 
 class Figure(NamedTuple):
-    """One measured figure, as it goes to the CSV file."""
+    """One measured figure, as stored in the CSV file."""
 
-    what: str
-    usual: Any  # a number of any make; NaN: there is none
+    quantity: str
+    usual: Any  # a number of any type; NaN if there is none
     vijax: Any
 
 
 class Scene(NamedTuple):
-    """A way to fail: how it is measured (in a small setting or not), what goes wrong, and what vijax does about it."""
+    """A failure: its measurement (in a small setting or not), a description, and vijax' solution."""
 
     measure: Callable[[bool], Iterator[Figure]]
     wrong: str
@@ -81,34 +81,34 @@ class Scene(NamedTuple):
 
 
 def run(d: Any, kappa: Any, u0: Any = U0, v0: Any = V0, dtype: str = "float64") -> Trajectory:
-    """Find the exact motion of N soft cells over `PERIODS` periods; leaves in numpy."""
-    given = [np.asarray(x, dtype) for x in np.broadcast_arrays(d, kappa, np.asarray(R), u0, v0)]
-    count = given[0].size
+    """Simulate N soft cells exactly over `PERIODS` periods; leaves in numpy."""
+    columns = [np.asarray(x, dtype) for x in np.broadcast_arrays(d, kappa, np.asarray(R), u0, v0)]
+    count = columns[0].size
     parts = []
     for first in range(0, count, LANES):
-        gap, stiffness, r, u, v = (jnp.asarray(np.resize(x[first : first + LANES], LANES)) for x in given)
+        gap, stiffness, r, u, v = (jnp.asarray(np.resize(x[first : first + LANES], LANES)) for x in columns)
         pair = vijax.impact_pair(gap, stiffness, r, jnp.zeros(LANES, dtype))
-        found = vijax.trajectory(pair, u, v, PERIODS, max_impacts=ROOM)
-        parts.append(jax.tree.map(np.asarray, found))
+        motion = vijax.trajectory(pair, u, v, PERIODS, max_impacts=CAPACITY)
+        parts.append(jax.tree.map(np.asarray, motion))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
 
 
 def impacts_in(motion: Trajectory, first: int, last: int) -> np.ndarray:
-    """Count impacts of each cell with onset in periods first ... last - 1; -1 where the run did not get there."""
+    """Count impacts of each cell with onset in periods first ... last - 1; -1 if the run ended earlier."""
     n, side = motion.impacts.n, motion.impacts.side
     counts = ((side != 0) & (n >= first) & (n < last)).sum(axis=1)
     return np.where(np.isfinite(motion.states.u[:, last - 1]), counts, -1)
 
 
 class Label(NamedTuple):
-    """Period of the motion that a run ends in (0: none up to 32) and its number of impacts, each [N]."""
+    """Period of the final motion of a run (0: none up to 32) and its number of impacts, each [N]."""
 
     period: Any
     impacts: Any
 
 
 def label(motion: Trajectory, dtype: str = "float64") -> Label:
-    """Find the least recurrence of the last stroboscopic state, and the impacts in the periods that it spans."""
+    """Return the least recurrence of the last stroboscopic state, and the impacts within it."""
     u, v = motion.states.u, motion.states.v
     recurs = np.stack(
         [
@@ -124,26 +124,26 @@ def label(motion: Trajectory, dtype: str = "float64") -> Label:
 
 @jax.jit
 def derivative(pair: ImpactPair, u0: Any, v0: Any, t0: Any, along: tuple[Any, Any]) -> tuple[Any, Any]:
-    """Run exactly for a short while, with the derivative along (d pair, d u0)."""
+    """Run exactly for a short time, with the derivative along (d pair, d u0)."""
 
     def motion(pair, u0):
-        return vijax.trajectory(pair, u0, v0, SHORT, t0, max_impacts=SHORT_ROOM)
+        return vijax.trajectory(pair, u0, v0, SHORT, t0, max_impacts=SHORT_CAPACITY)
 
     return jax.jvp(motion, (pair, u0), along)
 
 
 def by_kappa(kappa: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute displacement after a short run of the regular cell, and its derivative by kappa, exact."""
+    """Return displacement after a short run of the regular cell, and its exact derivative by kappa."""
     pair = vijax.impact_pair(D_REGULAR, kappa, R)
-    still = jnp.zeros(kappa.shape)
-    along = ImpactPair(still, still + 1, still, still)
-    motion, rate = derivative(pair, still + U0, still + V0, still, (along, still))
+    zeros = jnp.zeros(kappa.shape)
+    along = ImpactPair(zeros, zeros + 1, zeros, zeros)
+    motion, rate = derivative(pair, zeros + U0, zeros + V0, zeros, (along, zeros))
     return np.asarray(motion.states.u)[:, -1], np.asarray(rate.states.u)[:, -1]
 
 
 @lru_cache
 def located(solver: str) -> Callable[[np.ndarray, int], tuple[np.ndarray, np.ndarray]]:
-    """Compute the same by steps of a solver with located events, as a function of kappa and steps per period."""
+    """Return a function of kappa and steps per period with the same results, by a solver with located events."""
 
     @jax.jit
     def both(kappa, dt):
@@ -163,7 +163,7 @@ def located(solver: str) -> Callable[[np.ndarray, int], tuple[np.ndarray, np.nda
 
 
 def located_place(solver: str, kappa: np.ndarray, steps: int) -> np.ndarray:
-    """Compute the displacement alone."""
+    """Return the displacement alone."""
     return located(solver)(kappa, steps)[0]
 
 
@@ -172,9 +172,9 @@ def slope(x: Any, y: Any) -> float:
     return float(np.polyfit(np.log(x), np.log(y), 1)[0])
 
 
-def plane(side: int, most: float) -> tuple[np.ndarray, np.ndarray]:
-    """Lay out cells of the (d, kappa) plane of the benchmarks, up to a stiffness, [side^2] each."""
-    d, kappa = np.meshgrid(np.linspace(0.08, 0.3, side), np.geomspace(4, most, side), indexing="ij")
+def plane(side: int, largest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return cells of the benchmarks' (d, kappa) plane up to a stiffness, [side^2] each."""
+    d, kappa = np.meshgrid(np.linspace(0.08, 0.3, side), np.geomspace(4, largest, side), indexing="ij")
     return d.ravel(), kappa.ravel()
 
 
@@ -182,7 +182,7 @@ def plane(side: int, most: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 class StabilityMap(NamedTuple):
-    """Where RK4 stays bounded: stable[i, j] at steps[i] and kappa[j], and the least steps that theory asks for."""
+    """Stability of RK4: stable[i, j] at steps[i] and kappa[j], and the least steps by theory."""
 
     kappa: np.ndarray
     steps: np.ndarray
@@ -194,16 +194,16 @@ STABILITY_SIDES = {True: 24, False: 96}
 
 
 def stability_limit(r: float) -> float:
-    """Find the largest kappa h at which RK4 damps w'' + mu w' + kappa^2 w = 0."""
+    """Return the largest kappa h for which RK4 damps w'' + mu w' + kappa^2 w = 0."""
     ratio = float(damping_ratio(r))
     direction = complex(-ratio, np.sqrt(1 - ratio**2))
     z = np.linspace(0, 4, 40_001)[1:] * direction
     growth = np.abs(1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4))))
-    return float(np.abs(z[np.argmax(growth > 1 + 1e-12)]))  # at r = 1 rounding alone grows
+    return float(np.abs(z[np.argmax(growth > 1 + 1e-12)]))  # at r = 1 rounding errors alone grow
 
 
 def stability_map(side: int) -> StabilityMap:
-    """Run RK4 for 50 periods; what ever reaches 20 times the speed of the true motion has blown up."""
+    """Run RK4 for 50 periods; a run has blown up if it reaches 20 times the speed of the exact motion."""
     kappa, steps = np.geomspace(20, 4000, side), np.unique(np.geomspace(16, 4096, side).astype(int))
     stable = []
     for count in steps:
@@ -214,16 +214,18 @@ def stability_map(side: int) -> StabilityMap:
 
 def stability(quick: bool) -> Iterator[Figure]:
     """Take explicit steps on a stiff wall."""
-    found = stability_map(STABILITY_SIDES[quick])
-    short = found.steps[:, None] < 0.9 * found.least_steps
-    ample = found.steps[:, None] > 1.1 * found.least_steps
-    bounded = np.mean(np.abs(run(D_REGULAR, found.kappa).states.v[:, 49]) < 2)
+    stability_data = stability_map(STABILITY_SIDES[quick])
+    below = stability_data.steps[:, None] < 0.9 * stability_data.least_steps
+    above = stability_data.steps[:, None] > 1.1 * stability_data.least_steps
+    bounded = np.mean(np.abs(run(D_REGULAR, stability_data.kappa).states.v[:, 49]) < 2)
     yield Figure("kappa h where RK4 of the oscillator itself ends (theory)", stability_limit(R), NONE)
-    first = found.stable.argmax(axis=0)  # steps from which on a column is bounded
-    blown = np.median((2 * found.kappa / found.steps[first])[first > 0])
-    yield Figure("kappa h from which on runs blow up, median", blown, NONE)
-    yield Figure("cells bounded, 10 % and more below the steps of theory", float(found.stable[short].mean()), bounded)
-    yield Figure("cells bounded, 10 % and more above", float(found.stable[ample].mean()), bounded)
+    first_stable = stability_data.stable.argmax(axis=0)  # first number of steps at which a column is bounded
+    limit = np.median((2 * stability_data.kappa / stability_data.steps[first_stable])[first_stable > 0])
+    yield Figure("kappa h from which on runs blow up, median", limit, NONE)
+    yield Figure(
+        "cells bounded, 10 % and more below the steps of theory", float(stability_data.stable[below].mean()), bounded
+    )
+    yield Figure("cells bounded, 10 % and more above", float(stability_data.stable[above].mean()), bounded)
 
 
 _UNLOCATED = ("Tsit5", "Dopri8")
@@ -240,97 +242,101 @@ _ORDER_STEPS = {
 def order(quick: bool) -> Iterator[Figure]:
     """Measure convergence of the state after three periods, root of the mean square over kappa."""
     kappa = np.linspace(20, 40, 16)
-    true, _ = by_kappa(kappa)
+    exact, _ = by_kappa(kappa)
 
     def rate(last: Callable[[int], np.ndarray], low: int, high: int) -> float:
         steps = np.geomspace(low, high, 5).astype(int)
-        return -slope(steps, [np.sqrt(np.mean((last(int(n)) - true) ** 2)) for n in steps])
+        return -slope(steps, [np.sqrt(np.mean((last(int(n)) - exact) ** 2)) for n in steps])
 
-    by_samples = rate(lambda n: rk4(np.full(16, D_REGULAR), kappa, R, U0, V0, SHORT, n)[1], 500, 16_000)
-    yield Figure("fitted order of RK4 (4)", by_samples, NONE)
+    sampled_order = rate(lambda n: rk4(np.full(16, D_REGULAR), kappa, R, U0, V0, SHORT, n)[1], 500, 16_000)
+    yield Figure("fitted order of RK4 (4)", sampled_order, NONE)
     for name, nominal in _LOCATED.items():
         if quick and name != "Tsit5":
             continue
-        blind = NONE
+        unlocated_order = NONE
         if not quick and name in _UNLOCATED:
-            blind = rate(naive.where_solver(name, D_REGULAR, kappa, R, U0, V0, SHORT), 500, 8000)
-        seen = rate(partial(located_place, name, kappa), *_ORDER_STEPS[name])
-        yield Figure(f"fitted order of {name} ({nominal}), events not located and located", blind, seen)
+            unlocated_order = rate(naive.where_solver(name, D_REGULAR, kappa, R, U0, V0, SHORT), 500, 8000)
+        located_order = rate(partial(located_place, name, kappa), *_ORDER_STEPS[name])
+        yield Figure(
+            f"fitted order of {name} ({nominal}), events not located and located", unlocated_order, located_order
+        )
 
 
 def speeds(quick: bool) -> Iterator[Figure]:
     """Measure entry speeds of the first impacts at kappa 400 by 1024 samples a period, over 64 starts."""
     v0 = np.linspace(0.2, 0.6, LANES)
-    true = run(D_REGULAR, 400.0, U0, v0).impacts
-    formula = v0 + np.sin(np.pi * true.t[:, 0]) / np.pi
+    exact = run(D_REGULAR, 400.0, U0, v0).impacts
+    formula = v0 + np.sin(np.pi * exact.t[:, 0]) / np.pi
     pair = vijax.impact_pair(np.full(LANES, D_REGULAR), 400.0, R)
-    got = vijax.trajectory(pair, U0, jnp.asarray(v0), 1, max_impacts=4, method="rk4", steps=1024).impacts
-    sampled, ours = (np.abs(np.asarray(v_in)[:, 0] / formula - 1) for v_in in (got.v_in, true.v_in))
-    for how, of in (("median", np.median), ("worst", np.max)):
-        yield Figure(f"entry speed wrong by, {how}", float(of(sampled)), float(of(ours)))
+    stepped = vijax.trajectory(pair, U0, jnp.asarray(v0), 1, max_impacts=4, method="rk4", steps=1024).impacts
+    sampled, exact_errors = (np.abs(np.asarray(v_in)[:, 0] / formula - 1) for v_in in (stepped.v_in, exact.v_in))
+    for name, statistic in (("median", np.median), ("worst", np.max)):
+        yield Figure(f"entry speed wrong by, {name}", float(statistic(sampled)), float(statistic(exact_errors)))
 
 
 def reference_cells(count: int | None = None) -> dict[str, np.ndarray]:
-    """Read periodic cells with one attractor, wherever they start: d, kappa, period p, impacts left and right."""
+    """Read periodic cells with one attractor for all starts: d, kappa, period p, impacts left and right."""
     stored = json.loads(REFERENCE.read_text())["cells"]
     cells = [cell for cell in stored if cell["p"] and cell["attractors_found"] == 1][:count]
     return {name: np.array([cell[name] for cell in cells]) for name in ("d", "kappa", "p", "left", "right")}
 
 
 def labels(quick: bool) -> Iterator[Figure]:
-    """Count periodic reference cells whose motion RK4 does not repeat, or repeats with another number of impacts."""
+    """Count periodic reference cells that RK4 does not repeat, or repeats with another number of impacts."""
     cells = reference_cells(LANES if quick else None)
     d, kappa, period = cells["d"], cells["kappa"], cells["p"]
     impacts = cells["left"] + cells["right"]
-    found = label(run(d, kappa))
-    known = found.period > 0
-    restless, miscounted = np.mean(~known), np.mean((found.impacts != impacts)[known])
+    exact_labels = label(run(d, kappa))
+    is_periodic = exact_labels.period > 0
+    no_label, miscounted = np.mean(~is_periodic), np.mean((exact_labels.impacts != impacts)[is_periodic])
     for steps in (500, 2000) if quick else (500, 1000, 4000, 16_000):
         before = rk4(d, kappa, R, U0, V0, PERIODS, steps)
         recurs, more = np.zeros(d.size, bool), np.zeros(d.size)
         for p in np.unique(period):
-            here = period == p
-            after = rk4(d[here], kappa[here], R, U0, V0, PERIODS + int(p), steps)
-            recurs[here] = np.hypot(after[1] - before[1][here], after[2] - before[2][here]) < 1e-4
-            more[here] = after[0] * (PERIODS + p) - before[0][here] * PERIODS
+            rows = period == p
+            after = rk4(d[rows], kappa[rows], R, U0, V0, PERIODS + int(p), steps)
+            recurs[rows] = np.hypot(after[1] - before[1][rows], after[2] - before[2][rows]) < 1e-4
+            more[rows] = after[0] * (PERIODS + p) - before[0][rows] * PERIODS
         miscounts = np.mean(np.rint(more) != impacts)
         yield Figure(f"cells with another number of impacts, {steps} steps a period", miscounts, miscounted)
-        yield Figure(f"cells that do not recur to 1e-4, {steps} steps a period", np.mean(~recurs), restless)
+        yield Figure(f"cells that do not recur to 1e-4, {steps} steps a period", np.mean(~recurs), no_label)
 
 
 def gradients(quick: bool) -> Iterator[Figure]:
-    """Measure the derivative of displacement after three periods by kappa, median relative error over kappa."""
+    """Measure the derivative of displacement after three periods by kappa: median relative error over kappa."""
     kappa = np.linspace(20, 40, 16)
-    _, true = by_kappa(kappa)
+    _, exact = by_kappa(kappa)
     h = 1e-5
-    around = [by_kappa(kappa + step * h)[0] for step in (-2, -1, 1, 2)]
-    quotient = (around[0] - 8 * around[1] + 8 * around[2] - around[3]) / (12 * h)
+    neighbours = [by_kappa(kappa + step * h)[0] for step in (-2, -1, 1, 2)]
+    quotient = (neighbours[0] - 8 * neighbours[1] + 8 * neighbours[2] - neighbours[3]) / (12 * h)
     steps = (500, 2000, 8000, 32_000)
     d, r, u0, v0 = (jnp.asarray(x) for x in (D_REGULAR, R, U0, V0))
     for count, fewer in zip(steps, (60, 120, 240, 480), strict=True):
-        _, blind = naive.where_rk4(d, jnp.asarray(kappa), r, u0, v0, SHORT, count)
-        _, seen = located("Tsit5")(kappa, fewer)
-        errors = [float(np.median(np.abs(np.asarray(x) / true - 1))) for x in (blind, seen)]
+        _, unlocated = naive.where_rk4(d, jnp.asarray(kappa), r, u0, v0, SHORT, count)
+        _, located_slope = located("Tsit5")(kappa, fewer)
+        errors = [float(np.median(np.abs(np.asarray(x) / exact - 1))) for x in (unlocated, located_slope)]
         yield Figure(f"error of the gradient: {count} steps through `where`, {fewer} of Tsit5 located", *errors)
     yield Figure(
-        "the same of the exact engine, against differences", NONE, float(np.median(np.abs(true / quotient - 1)))
+        "the same of the exact engine, against differences", NONE, float(np.median(np.abs(exact / quotient - 1)))
     )
 
 
 @jax.jit
 @jax.vmap
-def one_impact(pair: ImpactPair, state: State) -> tuple[exact.Outcome, Any]:
-    """Find the first impact of each start, and its tangent map."""
-    out = exact.step(pair, state, jnp.asarray(4.0), deep=False)
-    return out, exact.tangent(pair, out)
+def impact_of_start(pair: ImpactPair, state: State) -> tuple[exact_step.ExactResult, Any]:
+    """Return the first impact of each start, and its tangent map."""
+    out = exact_step.step(pair, state, jnp.asarray(4.0), deep=False)
+    return out, exact_step.tangent_map(pair, out)
 
 
-def first_impact(d: Any, kappa: float | None, u0: Any, v0: Any, t0: Any = 0.0) -> tuple[exact.Outcome, np.ndarray]:
-    """Find `one_impact` of starts in flight, leaves in numpy."""
+def first_impact(
+    d: Any, kappa: float | None, u0: Any, v0: Any, t0: Any = 0.0
+) -> tuple[exact_step.ExactResult, np.ndarray]:
+    """Return `impact_of_start` of starts in flight, leaves in numpy."""
     d, u0, v0, t0 = (jnp.asarray(x) for x in np.broadcast_arrays(d, u0, v0, t0))
-    whole = jnp.zeros(d.shape, jnp.int32)
+    zeros = jnp.zeros(d.shape, jnp.int32)
     pair = vijax.impact_pair(d, kappa, R)
-    return jax.tree.map(np.asarray, one_impact(pair, State(u0, v0, t0, whole, whole)))
+    return jax.tree.map(np.asarray, impact_of_start(pair, State(u0, v0, t0, zeros, zeros)))
 
 
 def flight(u0: Any, v0: Any, t: Any) -> Any:
@@ -339,32 +345,34 @@ def flight(u0: Any, v0: Any, t: Any) -> Any:
 
 
 def roots(quick: bool) -> Iterator[Figure]:
-    """Find first impacts: of drawn flights by an event solver; of flights that just reach a wall, by samples too."""
+    """Compute first impacts: of random flights by an event solver; of grazing flights by samples as well."""
     rng = np.random.default_rng(SEED)
     count = 1024 if quick else 16_384
     d = rng.uniform(0.05, 0.3, count)
     u0, v0 = d * rng.uniform(-0.49, 0.49, count), rng.uniform(-0.6, 0.6, count)
-    meets, solved = first_impact(d, None, u0, v0)[0], naive.event_solver(*map(jnp.asarray, (d, u0, v0)))
-    times = np.linspace(0, 1, 2000)[:-1] * meets.flight[:, None]
+    first, solved = first_impact(d, None, u0, v0)[0], naive.event_solver(*map(jnp.asarray, (d, u0, v0)))
+    times = np.linspace(0, 1, 2000)[:-1] * first.flight[:, None]
     before = np.abs(flight(u0[:, None], v0[:, None], times)).max(axis=1) - d / 2
-    at = np.abs(np.abs(flight(u0, v0, meets.flight)) - d / 2)
-    hit = meets.impact.side != 0
-    wrong = ~(np.abs(np.asarray(solved) - meets.flight) < 1e-3)
-    astray = (before > 1e-12) | (at > 1e-12)
-    yield Figure("first impacts wrong, Newton in an event solver", wrong[hit].mean(), astray[hit].mean())
+    residual = np.abs(np.abs(flight(u0, v0, first.flight)) - d / 2)
+    is_impact = first.impact.side != 0
+    wrong = ~(np.abs(np.asarray(solved) - first.flight) < 1e-3)
+    wrong_exact = (before > 1e-12) | (residual > 1e-12)
+    yield Figure(
+        "first impacts wrong, Newton in an event solver", wrong[is_impact].mean(), wrong_exact[is_impact].mean()
+    )
 
-    # Flights that turn at a time `top`, so far beyond the right wall; rising all the way there.
+    # Flights with their turning point at time `top`, slightly beyond the right wall, and rising until then.
     top, height = rng.uniform(1, 1.4, count), 10 ** rng.uniform(-8, -4, count)
     v0 = -np.sin(np.pi * top) / np.pi
     rise = flight(0.0, v0, top)
     d = 1.2 * rise
     u0 = d / 2 + height - rise
-    meets, solved = first_impact(d, None, u0, v0)[0], naive.event_solver(*map(jnp.asarray, (d, u0, v0)))
-    missed = ~((meets.impact.side == 1) & (meets.flight < top))
+    first, solved = first_impact(d, None, u0, v0)[0], naive.event_solver(*map(jnp.asarray, (d, u0, v0)))
+    missed = ~((first.impact.side == 1) & (first.flight < top))
     h = 2 / 1000
     samples = h * (np.floor(top / h)[:, None] + np.arange(2))
-    unseen = (flight(u0[:, None], v0[:, None], samples) < d[:, None] / 2).all(axis=1)
-    yield Figure("shallow impacts missed by 1000 samples a period", unseen.mean(), missed.mean())
+    missed_by_samples = (flight(u0[:, None], v0[:, None], samples) < d[:, None] / 2).all(axis=1)
+    yield Figure("shallow impacts missed by 1000 samples a period", missed_by_samples.mean(), missed.mean())
     yield Figure("shallow impacts missed by signs at an event solver's steps", np.mean(~(solved < top)), missed.mean())
 
 
@@ -372,29 +380,29 @@ def chatter_restarts(quick: bool) -> Iterator[Figure]:
     """Chain SciPy restarts over two periods between rigid walls at d 0.0222 (omega pi/3, s 0.2)."""
     restarts = 500 if quick else 5000
     chain = naive.restart_chain(D_SLOW, R, 0.0, 0.1, 2, restarts)
-    motion = vijax.trajectory(vijax.impact_pair(D_SLOW, None, R), 0.0, 0.1, SHORT, max_impacts=SHORT_ROOM * 2)
+    motion = vijax.trajectory(vijax.impact_pair(D_SLOW, None, R), 0.0, 0.1, SHORT, max_impacts=SHORT_CAPACITY * 2)
     onsets = np.asarray(motion.impacts.t) + 2 * np.asarray(motion.impacts.n)
     stuck = np.max(np.diff(onsets[: int(motion.filled)]))
-    reached = float(np.isfinite(np.asarray(motion.states.u)).sum()) * 2
-    yield Figure(f"time reached of 4 in {restarts} restarts, of 6 in {int(motion.filled)} impacts", chain.t, reached)
+    end_time = float(np.isfinite(np.asarray(motion.states.u)).sum()) * 2
+    yield Figure(f"time reached of 4 in {restarts} restarts, of 6 in {int(motion.filled)} impacts", chain.t, end_time)
     yield Figure("restarts that did not advance time", float(chain.still), 0.0)
     yield Figure("longest stay at a wall in chatter", NONE, stuck)
 
 
 def grazing(quick: bool) -> Iterator[Figure]:
-    """Differentiate the velocity after one impact by the start, as the impact becomes slow."""
+    """Differentiate the velocity after one impact by the start, for decreasing impact speed."""
     speed, start, end = np.geomspace(1e-6, 1e-2, 9), 0.6, 2.0
-    # Backwards from an impact at phase 1, where the ball is turned back by the forcing.
-    turned, span = np.pi * start, 1 - start
-    v0 = speed + np.sin(turned) / np.pi
-    rise = v0 * span + (np.cos(turned) + 1 - np.pi * span * np.sin(turned)) / np.pi**2
+    # Backwards from an impact at phase 1, where the excitation turns the ball around.
+    start_angle, span = np.pi * start, 1 - start
+    v0 = speed + np.sin(start_angle) / np.pi
+    rise = v0 * span + (np.cos(start_angle) + 1 - np.pi * span * np.sin(start_angle)) / np.pi**2
     d = 0.3
     for name, kappa in (("rigid", None), ("soft, kappa 40", 40.0)):
 
         def velocity(shift: Any, kappa: float | None = kappa) -> tuple[np.ndarray, np.ndarray]:
-            out, tangent = first_impact(d, kappa, d / 2 - rise + shift, v0, start)
-            # A ball that missed the wall has flown on from where it was.
-            after = out.state
+            outcome, tangent = first_impact(d, kappa, d / 2 - rise + shift, v0, start)
+            # If the ball misses the wall, its flight continues from the start.
+            after = outcome.state
             return after.v + (np.sin(np.pi * end) - np.sin(np.pi * after.t)) / np.pi, tangent
 
         tangent = velocity(0.0)[1]
@@ -404,26 +412,26 @@ def grazing(quick: bool) -> Iterator[Figure]:
         if kappa is not None:
             continue
         yield Figure("exponent of the sensitivity in the speed, rigid", NONE, slope(speed, size))
-        true, slow, errors = tangent[:, 1, 0], int(np.argmin(np.abs(speed - 1e-4))), []
+        exact, slow_index, errors = tangent[:, 1, 0], int(np.argmin(np.abs(speed - 1e-4))), []
         for h in (1e-6, 1e-3 * speed**2):
             quotient = (velocity(h)[0] - velocity(-h)[0]) / (2 * h)
-            errors.append(abs((quotient / true)[slow] - 1))
+            errors.append(abs((quotient / exact)[slow_index] - 1))
         yield Figure("rigid, speed 1e-4: differences of 1e-6 against the tangent map; of 1e-11", *errors)
 
 
 def chatter(quick: bool) -> Iterator[Figure]:
     """Count impacts per period at d 0.0222 against kappa, periods 20 to 50, by RK4 and exactly."""
     kappa = np.array([12.0, 40.0, 120.0, 400.0, 1200.0]) if quick else np.geomspace(6, 4000, 24)
-    true = impacts_in(run(D_SLOW, kappa, 0.0, 0.1), *SLOW_WINDOW) / np.ptp(SLOW_WINDOW)
+    exact = impacts_in(run(D_SLOW, kappa, 0.0, 0.1), *SLOW_WINDOW) / np.ptp(SLOW_WINDOW)
     for steps in (1000, 4000):
         early, late = (rk4(np.full(kappa.size, D_SLOW), kappa, R, 0.0, 0.1, n, steps)[0] * n for n in SLOW_WINDOW)
         counted = (late - early) / np.ptp(SLOW_WINDOW)
-        for at, got, want in zip(kappa, counted, true, strict=True):
-            yield Figure(f"impacts per period at kappa {at:.4g}, {steps} steps", got, want)
+        for stiffness, stepped, exact_count in zip(kappa, counted, exact, strict=True):
+            yield Figure(f"impacts per period at kappa {stiffness:.4g}, {steps} steps", stepped, exact_count)
 
 
 def chaos(quick: bool) -> Iterator[Figure]:
-    """Follow a perturbation of 2e-16 at d 0.12, kappa 400: when it matters, and what it leaves alone."""
+    """Follow a perturbation of 2e-16 at d 0.12, kappa 400: its growth, and its effect on averages."""
     v0 = np.linspace(0.3, 0.5, 32)
     motion = run(D_CHAOS, 400.0, np.repeat([U0, U0 + 2.2e-16], 32), np.tile(v0, 2))
     u, v = (x.reshape(2, 32, PERIODS) for x in (motion.states.u, motion.states.v))
@@ -443,25 +451,27 @@ def windows(quick: bool) -> Iterator[Figure]:
     d, kappa = plane(16, 400)
     if quick:
         cells = reference_cells()
-        some = np.flatnonzero(cells["p"] > 1)[: LANES // starts]
-        d, kappa = cells["d"][some], cells["kappa"][some]
+        selected = np.flatnonzero(cells["p"] > 1)[: LANES // starts]
+        d, kappa = cells["d"][selected], cells["kappa"][selected]
     u0, v0 = np.repeat(d, starts) * rng.uniform(-0.4, 0.4, d.size * starts), rng.uniform(-0.6, 0.6, d.size * starts)
     motion = run(np.repeat(d, starts), np.repeat(kappa, starts), u0, v0)
-    found = label(motion)
-    n, there = motion.impacts.n, motion.impacts.side != 0
+    motion_labels = label(motion)
+    n, is_impact = motion.impacts.n, motion.impacts.side != 0
     energy = np.where(
-        there,
-        np.asarray(vijax.harvested_energy(vijax.Harvester(), jnp.asarray(np.where(there, motion.impacts.depth, 0.0)))),
+        is_impact,
+        np.asarray(
+            vijax.harvested_energy(vijax.Harvester(), jnp.asarray(np.where(is_impact, motion.impacts.depth, 0.0)))
+        ),
         0.0,
     )
-    spans = np.full(found.period.size, 25), np.where(found.period > 0, found.period, 1)
-    cut, whole = (
+    spans = np.full(motion_labels.period.size, 25), np.where(motion_labels.period > 0, motion_labels.period, 1)
+    cut, full = (
         ((n >= PERIODS - span[:, None]) * energy).sum(axis=1).reshape(-1, starts) / span.reshape(-1, starts)
         for span in spans
     )
-    settled = (found.period.reshape(-1, starts) > 0).all(axis=1) & (whole.min(axis=1) > 0)
-    many = [np.mean(np.ptp(power[settled], axis=1) > 1e-3 * power[settled].mean(axis=1)) for power in (cut, whole)]
-    yield Figure("settled cells called multistable", *map(float, many))
+    settled = (motion_labels.period.reshape(-1, starts) > 0).all(axis=1) & (full.min(axis=1) > 0)
+    share = [np.mean(np.ptp(power[settled], axis=1) > 1e-3 * power[settled].mean(axis=1)) for power in (cut, full)]
+    yield Figure("settled cells called multistable", *map(float, share))
     yield Figure("settled cells", float(settled.sum()), float(settled.sum()))
 
 
@@ -470,12 +480,12 @@ def resonance(quick: bool) -> Iterator[Figure]:
     for power in (4, 8, 12):
         kappa, r, speed, s = np.pi * (1 + 10.0**-power), 1 - 10.0**-power, 0.3, 0.7
         with mpmath.workdps(50):
-            exactly = [mpmath.mpf(x) for x in (kappa, r, speed, s)]
-            true = partial(naive.contact, xp=mpmath.mp)(*exactly)
+            numbers = [mpmath.mpf(x) for x in (kappa, r, speed, s)]
+            exact = partial(naive.contact, xp=mpmath.mp)(*numbers)
         pair = vijax.impact_pair(D_REGULAR, kappa, r)
-        zero, one = jnp.zeros(()), jnp.ones(())
-        w, _ = flow.oscillate(flow.membrane(pair), flow.contact_force(zero, one, zero), zero, speed * one, s * one)
-        errors = (abs(float(got / true - 1)) for got in (naive.contact(kappa, r, speed, s), mpmath.mpf(float(w))))
+        zero, unit = jnp.zeros(()), jnp.ones(())
+        w, _ = flow.oscillate(flow.membrane(pair), flow.contact_force(zero, unit, zero), zero, speed * unit, s * unit)
+        errors = (abs(float(value / exact - 1)) for value in (naive.contact(kappa, r, speed, s), mpmath.mpf(float(w))))
         yield Figure(f"error of the penetration, e = 1e-{power}", *errors)
 
 
@@ -485,15 +495,15 @@ def single_precision(quick: bool) -> Iterator[Figure]:
     d, kappa = (cells["d"], cells["kappa"]) if quick else plane(24, 400)
     double, single = (run(d, kappa, dtype=dtype) for dtype in RECURRENCE)
     error = np.abs(single.impacts.v_in.astype(float) / double.impacts.v_in - 1)
-    known, got = label(double), label(single, "float32")
-    sure = known.period > 0
-    other = (got.period != known.period) | (got.impacts != known.impacts)
+    double_labels, single_labels = label(double), label(single, "float32")
+    is_periodic = double_labels.period > 0
+    differs = (single_labels.period != double_labels.period) | (single_labels.impacts != double_labels.impacts)
     for nth in (1, 8, 32):
         yield Figure(f"error of entry speed number {nth}, median", float(np.nanmedian(error[:, nth - 1])), NONE)
     formula = V0 + np.sin(np.pi * double.impacts.t[:, 0]) / np.pi
-    ours = np.abs(double.impacts.v_in[:, 0] / formula - 1)
-    yield Figure("error of entry speed number 1, worst; of float64", np.nanmax(error[:, 0]), np.nanmax(ours))
-    yield Figure("periodic cells labelled otherwise", float(other[sure].mean()), NONE)
+    exact_errors = np.abs(double.impacts.v_in[:, 0] / formula - 1)
+    yield Figure("error of entry speed number 1, worst; of float64", np.nanmax(error[:, 0]), np.nanmax(exact_errors))
+    yield Figure("periodic cells labelled otherwise", float(differs[is_periodic].mean()), NONE)
 
 
 SCENES = {
@@ -566,30 +576,30 @@ SCENES = {
 
 
 def main() -> None:
-    """Measure what the command line asks for, print it, and save the figures."""
+    """Measure the scenes that the command line selects, print and save the figures."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="small settings")
     parser.add_argument("--only", choices=list(SCENES), action="append", help="one scene; may be given again")
     parser.add_argument("--plot", type=Path, help="draw the stability map there, and measure nothing else")
     parser.add_argument("--rows", type=Path, default=tables.ROWS, help="folder for the figures")
-    given = parser.parse_args()
+    options = parser.parse_args()
 
-    if given.plot:
-        charts.stability_map(stability_map(STABILITY_SIDES[given.quick]), given.plot)
+    if options.plot:
+        charts.stability_map(stability_map(STABILITY_SIDES[options.quick]), options.plot)
         return
-    part = "_quick" if given.quick or given.only else ""
-    rows = measured(given.only or list(SCENES), given.quick)
-    tables.write(given.rows / f"failures{part}.csv", ["scene", *Figure._fields], rows)
+    part = "_quick" if options.quick or options.only else ""
+    rows = measured(options.only or list(SCENES), options.quick)
+    tables.write(options.rows / f"failures{part}.csv", ["scene", *Figure._fields], rows)
 
 
 def measured(names: list[str], quick: bool) -> Iterator[list[Any]]:
-    """Measure scenes, print each figure, and give it with its scene."""
+    """Measure scenes, print each figure, and yield it with its scene."""
     for name in names:
         scene = SCENES[name]
         print(f"{name}: {scene.wrong}")
         for figure in scene.measure(quick):
-            usual, ours = ("-" if x != x else f"{x:.3g}" for x in figure[1:])
-            print(f"    {figure.what:74} {usual:>9} {ours:>9}", flush=True)
+            usual_text, exact_text = ("-" if x != x else f"{x:.3g}" for x in figure[1:])
+            print(f"    {figure.quantity:74} {usual_text:>9} {exact_text:>9}", flush=True)
             yield [name, *figure]
         print(f"    vijax: {scene.answer}")
 

@@ -1,13 +1,13 @@
-"""What does a study lose when it is killed, its disk is full or its files are damaged?
+"""How much does a study lose if it is killed, its disk is full or its files are damaged?
 
     python benchmarks/faults.py                          # every fault, each from the start
     python benchmarks/faults.py --only kill --kills 20   # one of them: kill, stop, worker, disk, readonly,
                                                          # damages, overwrite, foreign, writers, savers
     python benchmarks/faults.py --side 256               # a smaller plane
 
-Each fault befalls `scripts/grid.py` on the (d, kappa) plane of side x side cells. Said are the moments, what the script
-told, how many tiles were run more than once, and whether variables and coordinates of the finished store are, bit for
-bit, those of a run that nothing befell. Exit code 1 if any is not.
+Each fault is applied to `scripts/grid.py` on the (d, kappa) plane of side x side cells. The output has the moments, the
+script's messages, the number of tiles that ran more than once, and whether the finished store's variables and
+coordinates are bit-identical to an undisturbed run. Exit code 1 if any differs.
 """
 
 import argparse
@@ -37,36 +37,36 @@ if TYPE_CHECKING:
     import xarray as xr
 
 SCRIPT = Path(__file__).parent.parent / "scripts" / "grid.py"
-# Says which tile begins, and hears Ctrl-C though a background job's children ignore it.
+# Prints the number of every tile at its start, and accepts Ctrl-C although children of background jobs ignore it.
 WRAPPER = (
     "import logging, runpy, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
     "logging.basicConfig(format='%(message)s'); logging.getLogger('vijax').setLevel(logging.INFO); "
     "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
 )
-_WARM = 182  # the least side whose tiles are as large as any, so that they are compiled
-_REACH = 0.6  # of a tile's time past the first tile, up to which moments are drawn: most kills find none done
-_SAVES = 60  # of two processes at the same time
+_WARM = 182  # least side with tiles of full size, so that one run compiles their programs
+_REACH = 0.6  # latest moment of a kill, in tile times after the first tile
+_SAVES = 60  # saves by two processes at the same time
 _DISK, _LARGER_DISK = 5, 100  # MiB; a tile of 32,768 cells takes about 2
 
 
 @dataclass(frozen=True)
 class Scene:
-    """The plane, where stores go, and how long a run that nothing befalls takes to its first tile and for each."""
+    """The plane, the folder of the stores, and the times of an undisturbed run: until its first tile, and per tile."""
 
     side: int
     kills: int
     folder: Path
-    whole: Path
+    undisturbed: Path
     first: float
-    each: float
+    seconds_per_tile: float
 
     def store(self, name: str) -> Path:
-        """Give a path for a new store."""
+        """Return a path for a new store."""
         return self.folder / f"{name}.zarr"
 
     def moment(self) -> float:
-        """Draw seconds from the start of a process at random."""
-        return random.uniform(0, self.first + _REACH * self.each)
+        """Draw a random number of seconds after the start of a process."""
+        return random.uniform(0, self.first + _REACH * self.seconds_per_tile)
 
 
 def start(side: int, out: Path, *more: str, **options) -> subprocess.Popen:
@@ -78,23 +78,23 @@ def start(side: int, out: Path, *more: str, **options) -> subprocess.Popen:
 
 @dataclass(frozen=True)
 class End:
-    """How a run ended: exit code, tiles it began, its last line."""
+    """End of a run: exit code, number of started tiles, last line."""
 
     code: int
     began: int
-    said: str
+    last_line: str
 
 
 def ended(process: subprocess.Popen) -> End:
     """Wait for the end of a run."""
-    _, told = process.communicate()
-    lines = [line for line in re.split(r"[\r\n]+", told) if line.strip()]
-    said = [line for line in lines if "begins" not in line and "cells/s" not in line]
-    return End(process.returncode, sum(" begins" in line for line in lines), said[-1] if said else "")
+    _, output = process.communicate()
+    lines = [line for line in re.split(r"[\r\n]+", output) if line.strip()]
+    messages = [line for line in lines if "begins" not in line and "cells/s" not in line]
+    return End(process.returncode, sum(" begins" in line for line in lines), messages[-1] if messages else "")
 
 
 def done(out: Path) -> int:
-    """Count tiles that are done."""
+    """Count the finished tiles."""
     return len(list(out.glob("status/tiles/[0-9]*.json")))
 
 
@@ -103,26 +103,30 @@ def finish(scene: Scene, out: Path) -> End:
     return ended(start(scene.side, out))
 
 
-def differing(scene: Scene, found: "xr.Dataset") -> list[str]:
-    """Name variables and coordinates that differ, in any bit or in attributes, from those of an undisturbed run."""
+def differing(scene: Scene, dataset: "xr.Dataset") -> list[str]:
+    """Return the variables and coordinates that differ, in any bit or in attributes, from an undisturbed run."""
 
-    def same(one: "xr.DataArray", other: "xr.DataArray") -> bool:
-        return np.array_equal(one, other, equal_nan=True) and one.attrs == other.attrs
+    def same(left: "xr.DataArray", other: "xr.DataArray") -> bool:
+        return np.array_equal(left, other, equal_nan=True) and left.attrs == other.attrs
 
-    whole = vijax.load(scene.whole)
-    return [str(name) for name in whole.variables if name not in found or not same(found[name], whole[name])]
+    undisturbed_map = vijax.load(scene.undisturbed)
+    return [
+        str(name)
+        for name in undisturbed_map.variables
+        if name not in dataset or not same(dataset[name], undisturbed_map[name])
+    ]
 
 
-def is_whole(scene: Scene, found: "xr.Dataset") -> bool:
-    """Say whether a map is that of a run that nothing befell."""
-    return not differing(scene, found)
+def is_undisturbed(scene: Scene, dataset: "xr.Dataset") -> bool:
+    """Return True if a map equals the undisturbed run."""
+    return not differing(scene, dataset)
 
 
-def verdict(scene: Scene, out: Path, began: int | None = None) -> bool:
-    """Say whether the finished store is as it should be, and how many tiles were run more than once."""
+def check_store(scene: Scene, out: Path, began: int | None = None) -> bool:
+    """Return True if the finished store is undisturbed; print the number of tiles that ran more than once."""
     differ = differing(scene, vijax.load(out))
-    again = "" if began is None else f"; tiles run more than once: {began - done(out)} of {done(out)}"
-    print(f"    lost: {', '.join(differ) if differ else 'nothing, all equal bit for bit'}{again}")
+    repeated = "" if began is None else f"; tiles run more than once: {began - done(out)} of {done(out)}"
+    print(f"    lost: {', '.join(differ) if differ else 'nothing, all equal bit for bit'}{repeated}")
     shutil.rmtree(out)
     return not differ
 
@@ -143,21 +147,21 @@ def kill(scene: Scene) -> bool:
             break
     end = finish(scene, out)
     print(f"    {kills} kills; at most {worst} tiles begun in vain by one of them; exit code {end.code} in the end")
-    return verdict(scene, out, began + end.began)
+    return check_store(scene, out, began + end.began)
 
 
 def stop(scene: Scene) -> bool:
     """Send SIGTERM and SIGINT at a random moment."""
-    good = True
-    for which in (signal.SIGTERM, signal.SIGINT):
+    passed = True
+    for signal_number in (signal.SIGTERM, signal.SIGINT):
         out = scene.store("stop")
         process = start(scene.side, out)
-        time.sleep(scene.first + random.random() * scene.each)
-        process.send_signal(which)
+        time.sleep(scene.first + random.random() * scene.seconds_per_tile)
+        process.send_signal(signal_number)
         end = ended(process)
-        print(f"    {which.name}: exit code {end.code}: {end.said}")
-        good &= verdict(scene, out, end.began + finish(scene, out).began)
-    return good
+        print(f"    {signal_number.name}: exit code {end.code}: {end.last_line}")
+        passed &= check_store(scene, out, end.began + finish(scene, out).began)
+    return passed
 
 
 def worker(scene: Scene) -> bool:
@@ -166,21 +170,21 @@ def worker(scene: Scene) -> bool:
     process = start(scene.side, out, "--workers", "2")
     while process.poll() is None and not done(out):
         time.sleep(0.1)
-    time.sleep(random.random() * scene.each)
-    before, found = (
+    time.sleep(random.random() * scene.seconds_per_tile)
+    before, children = (
         done(out),
         subprocess.run(["pgrep", "-P", str(process.pid), "-f", "spawn_main"], capture_output=True),
     )
-    crew = [int(number) for number in found.stdout.split()]
-    os.kill(random.choice(crew), signal.SIGKILL)
+    workers = [int(number) for number in children.stdout.split()]
+    os.kill(random.choice(workers), signal.SIGKILL)
     end = ended(process)
-    print(f"    one of {len(crew)} killed when {before} tiles were done: exit code {end.code}: {end.said}")
-    return verdict(scene, out)
+    print(f"    one of {len(workers)} killed when {before} tiles were done: exit code {end.code}: {end.last_line}")
+    return check_store(scene, out)
 
 
 @contextmanager
 def disk(scene: Scene) -> Iterator[Path | None]:
-    """Mount a small file system in memory, if this user may."""
+    """Mount a small file system in memory, if the user may."""
     place = scene.folder / "disk"
     place.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", f"size={_DISK}m", "tmpfs", str(place)]
@@ -208,9 +212,9 @@ def full_disk(scene: Scene) -> bool:
         else:
             small = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (1 << 17, 1 << 17))
             end = ended(start(scene.side, out, preexec_fn=small))
-        what = f"a tmpfs of {_DISK} MiB" if place else "RLIMIT_FSIZE of 128 KiB, as no tmpfs may be mounted"
-        print(f"    {what}: exit code {end.code}: {end.said}")
-        return verdict(scene, out, end.began + finish(scene, out).began)
+        limit = f"a tmpfs of {_DISK} MiB" if place else "RLIMIT_FSIZE of 128 KiB, as no tmpfs may be mounted"
+        print(f"    {limit}: exit code {end.code}: {end.last_line}")
+        return check_store(scene, out, end.began + finish(scene, out).began)
 
 
 def readonly(scene: Scene) -> bool:
@@ -228,9 +232,9 @@ def readonly(scene: Scene) -> bool:
         began = ended(process).began
         remount(place, "ro")
         end = finish(scene, out)
-        print(f"    read-only: exit code {end.code}: {end.said}")
+        print(f"    read-only: exit code {end.code}: {end.last_line}")
         remount(place, "rw")
-        return verdict(scene, out, began + finish(scene, out).began)
+        return check_store(scene, out, began + finish(scene, out).began)
 
 
 def truncate(chunk: Path) -> None:
@@ -246,34 +250,34 @@ def flip(chunk: Path) -> None:
 
 
 def pipe(file: Path) -> None:
-    """Put what takes for ever to read in place of a file."""
+    """Replace a file by a pipe, which blocks its reader."""
     file.unlink()
     os.mkfifo(file)
 
 
 def device(file: Path) -> None:
-    """Put what never ends in place of a file."""
+    """Replace a file by a device without an end."""
     file.unlink()
     file.symlink_to("/dev/zero")
 
 
 def overwrite(file: Path) -> None:
-    """Write over a file what is no text."""
+    """Overwrite a file with bytes that are no text."""
     file.write_bytes(b"\xff\x00" * 40)
 
 
 def variable(file: Path) -> None:
-    """Take away the folder of a file."""
+    """Remove the folder of a file."""
     shutil.rmtree(file.parent)
 
 
 def exchange(file: Path) -> None:
-    """Put the values of another coordinate, a sound chunk, in place of these."""
+    """Replace the values by another coordinate's values, in an intact chunk."""
     shutil.copyfile(file.parent.parent.parent / "kappa" / "c" / "0", file)
 
 
 def entry(**entries: object) -> Callable[[Path], None]:
-    """Edit entries of a file of metadata."""
+    """Return a function that edits entries of a metadata file."""
 
     def edit(file: Path) -> None:
         file.write_text(json.dumps(json.loads(file.read_text()) | entries))
@@ -282,7 +286,7 @@ def entry(**entries: object) -> Callable[[Path], None]:
 
 
 def attribute(name: str, value: object) -> Callable[[Path], None]:
-    """Edit an attribute in a file of metadata; None takes it away."""
+    """Return a function that edits an attribute in a metadata file; None removes it."""
 
     def edit(file: Path) -> None:
         content = json.loads(file.read_text())
@@ -325,55 +329,55 @@ DAMAGES: dict[str, tuple[str, Callable[[Path], None]]] = {
 
 def damages(scene: Scene) -> bool:
     """Do each kind of damage to a finished store, read it and go on with it."""
-    good = True
+    passed = True
     for name, (where, damage) in DAMAGES.items():
         out = scene.store("damaged")
-        shutil.copytree(scene.whole, out)
+        shutil.copytree(scene.undisturbed, out)
         damage(random.choice(sorted(out.glob(where))))
         try:
-            said = "nothing, and the numbers are right" if is_whole(scene, vijax.load(out)) else "NOTHING"
+            message = "nothing, and the numbers are right" if is_undisturbed(scene, vijax.load(out)) else "NOTHING"
         except ValueError as error:
-            said = str(error).replace(str(out), out.name)
+            message = str(error).replace(str(out), out.name)
         end = finish(scene, out)
-        print(f"    {name}: load says {said}; exit code {end.code}; tiles run again: {end.began}")
-        good &= said != "NOTHING" and "\n" not in said and end.code == 0
-        good &= verdict(scene, out)
-    return good
+        print(f"    {name}: load says {message}; exit code {end.code}; tiles run again: {end.began}")
+        passed &= message != "NOTHING" and "\n" not in message and end.code == 0
+        passed &= check_store(scene, out)
+    return passed
 
 
 def stopped_overwrite(scene: Scene) -> bool:
     """Send SIGKILL while --overwrite puts a new store in the place of an old one; then run, anew or not."""
-    good = True
-    for more in ((), ("--overwrite",)):
+    passed = True
+    for options in ((), ("--overwrite",)):
         out = scene.store("overwritten")
-        shutil.copytree(scene.whole, out)
+        shutil.copytree(scene.undisturbed, out)
         process = start(scene.side, out, "--overwrite")
-        while not left(out) and process.poll() is None:
+        while not leftovers(out) and process.poll() is None:
             time.sleep(0.001)
         process.kill()
         ended(process)
-        before, end = left(out), ended(start(scene.side, out, *more))
+        before, end = leftovers(out), ended(start(scene.side, out, *options))
         print(f"    left: {', '.join(before) or 'nothing'}; exit code {end.code}; {end.began} tiles run again")
-        good &= bool(before) and not left(out)
-        good &= verdict(scene, out)
-    return good
+        passed &= bool(before) and not leftovers(out)
+        passed &= check_store(scene, out)
+    return passed
 
 
-def left(out: Path) -> list[str]:
-    """List what a killed run left beside a store."""
+def leftovers(out: Path) -> list[str]:
+    """Return the names of files that a killed run left beside a store."""
     return [path.name for path in out.parent.glob(f".{out.stem}.*")]
 
 
 def foreign(scene: Scene) -> bool:
-    """Put somebody's file in a store: --overwrite is refused, a run goes on."""
+    """Put a user's file in a store: --overwrite is refused, and a run resumes."""
     out = scene.store("foreign")
-    shutil.copytree(scene.whole, out)
-    thesis = out / "notes.part1.txt"
-    thesis.write_text("precious")
+    shutil.copytree(scene.undisturbed, out)
+    user_file = out / "notes.part1.txt"
+    user_file.write_text("precious")
     end = ended(start(scene.side, out, "--overwrite"))
-    print(f"    --overwrite: exit code {end.code}: {end.said}")
-    good = end.code == 2 and finish(scene, out).code == 0 and thesis.read_text() == "precious"
-    return verdict(scene, out) and good
+    print(f"    --overwrite: exit code {end.code}: {end.last_line}")
+    passed = end.code == 2 and finish(scene, out).code == 0 and user_file.read_text() == "precious"
+    return check_store(scene, out) and passed
 
 
 def writers(scene: Scene) -> bool:
@@ -383,30 +387,35 @@ def writers(scene: Scene) -> bool:
     while not done(out):
         time.sleep(0.1)
     second = finish(scene, out)
-    print(f"    second: exit code {second.code}: {second.said}")
-    return verdict(scene, out, ended(process).began + second.began)
+    print(f"    second: exit code {second.code}: {second.last_line}")
+    return check_store(scene, out, ended(process).began + second.began)
 
 
-# Saves a map of its own number at every line that it is sent.
+# Saves a map with its own number for every line that it receives.
 SAVER = """
 import sys, numpy as np, xarray as xr, vijax
-whole = xr.Dataset({"P": ("d", np.full(4096, float(sys.argv[2])))}, coords={"d": np.arange(4096.0)})
+dataset = xr.Dataset({"P": ("d", np.full(4096, float(sys.argv[2])))}, coords={"d": np.arange(4096.0)})
 print("ready", flush=True)
 for line in sys.stdin:
-    vijax.save(whole, sys.argv[1], overwrite=True)
+    vijax.save(dataset, sys.argv[1], overwrite=True)
     print("saved", flush=True)
 """
 
 
 def savers(scene: Scene) -> bool:
-    """Let two processes save to one path at the same time, each the first of its own PID namespace if that may be."""
+    """Let two processes save to one path at the same time, each in a PID namespace if the system permits."""
     out, wrong = scene.store("saved"), 0
-    apart = ["unshare", "--user", "--map-root-user", "--pid", "--fork"]
-    allowed = shutil.which("unshare") and subprocess.run([*apart, "true"], capture_output=True).returncode == 0
-    command = [*(apart if allowed else ()), sys.executable, "-c", SAVER, str(out)]
+    namespace_command = ["unshare", "--user", "--map-root-user", "--pid", "--fork"]
+    allowed = (
+        shutil.which("unshare") and subprocess.run([*namespace_command, "true"], capture_output=True).returncode == 0
+    )
+    command = [*(namespace_command if allowed else ()), sys.executable, "-c", SAVER, str(out)]
     pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "bufsize": 1}
-    crew = [subprocess.Popen([*command, str(number)], **pipes) for number in (1, 2)]
-    orders, answers = [one.stdin for one in crew if one.stdin], [one.stdout for one in crew if one.stdout]
+    processes = [subprocess.Popen([*command, str(number)], **pipes) for number in (1, 2)]
+    orders, answers = (
+        [process.stdin for process in processes if process.stdin],
+        [process.stdout for process in processes if process.stdout],
+    )
     for answer in answers:
         answer.readline()
     for _ in range(_SAVES):
@@ -419,11 +428,11 @@ def savers(scene: Scene) -> bool:
         except (ValueError, OSError) as error:
             print(f"    load: {error}")
             wrong += 1
-    for one in crew:
-        one.communicate()
-    where = "two PID namespaces" if allowed else "one PID namespace, as no other may be made"
-    print(f"    {where}: {wrong} of {_SAVES} times wrong; left beside: {', '.join(left(out)) or 'nothing'}")
-    return not wrong and not left(out)
+    for process in processes:
+        process.communicate()
+    namespaces = "two PID namespaces" if allowed else "one PID namespace, as no other may be made"
+    print(f"    {namespaces}: {wrong} of {_SAVES} times wrong; left beside: {', '.join(leftovers(out)) or 'nothing'}")
+    return not wrong and not leftovers(out)
 
 
 FAULTS: dict[str, Callable[[Scene], bool]] = {
@@ -441,37 +450,37 @@ FAULTS: dict[str, Callable[[Scene], bool]] = {
 
 
 def undisturbed(side: int, kills: int, folder: Path) -> Scene:
-    """Time a run that nothing befalls."""
-    out = folder / "whole.zarr"
+    """Time an undisturbed run, after a run that compiles."""
+    out = folder / "undisturbed.zarr"
     ended(start(min(side, _WARM), folder / "warm.zarr"))  # compiles
-    began, process, first = time.perf_counter(), start(side, out), 0.0
+    start_time, process, first_tile = time.perf_counter(), start(side, out), 0.0
     while process.poll() is None:
-        if not first and done(out):
-            first = time.perf_counter() - began
+        if not first_tile and done(out):
+            first_tile = time.perf_counter() - start_time
         time.sleep(0.05)
-    end, seconds = ended(process), time.perf_counter() - began
-    each = (seconds - first) / max(done(out) - 1, 1)
-    print(f"undisturbed: {seconds:.1f} s, {done(out)} tiles, the first after {first:.1f} s, exit code {end.code}")
-    return Scene(side, kills, folder, out, first, each)
+    end, seconds = ended(process), time.perf_counter() - start_time
+    seconds_per_tile = (seconds - first_tile) / max(done(out) - 1, 1)
+    print(f"undisturbed: {seconds:.1f} s, {done(out)} tiles, the first after {first_tile:.1f} s, exit code {end.code}")
+    return Scene(side, kills, folder, out, first_tile, seconds_per_tile)
 
 
 def main() -> int:
-    """Try all; exit with 0 if nothing was lost."""
+    """Apply all faults; return 0 if nothing is lost."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--only", choices=FAULTS, help="one fault")
     parser.add_argument("--side", type=int, default=512, help="cells along each axis [512]")
     parser.add_argument("--kills", type=int, default=20, help="kills during one plane [20]")
     parser.add_argument("--seed", type=int, default=0, help="of the moments [0]")
-    given = parser.parse_args()
-    random.seed(given.seed)
-    good = True
+    options = parser.parse_args()
+    random.seed(options.seed)
+    passed = True
     with tempfile.TemporaryDirectory() as folder:
-        scene = undisturbed(given.side, given.kills, Path(folder))
-        for name, fault in FAULTS.items():
-            if given.only in (None, name):
-                print(f"{name}: {(fault.__doc__ or '').rstrip('.')}")
-                good &= fault(scene)
-    return not good
+        scene = undisturbed(options.side, options.kills, Path(folder))
+        for name, inject in FAULTS.items():
+            if options.only in (None, name):
+                print(f"{name}: {(inject.__doc__ or '').rstrip('.')}")
+                passed &= inject(scene)
+    return not passed
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
-"""How long does a new Python process take to its first answer, with nothing kept, and with what an earlier one kept?
+"""How long does a new Python process take to its first result, without stored programs, and with stored ones?
 
     python benchmarks/first_answers.py                    # every question, three rounds: an hour
     python benchmarks/first_answers.py --only sweep       # one of them, and the peer
     python benchmarks/first_answers.py --tree ../before   # the sources of another checkout
 
-Every answer is that of a process of its own, from its start to its end: import, tracing, compilation, run. "Cold" is
-with an empty folder of programs, "kept" with what the cold process left there. The peer is a fixed program of JAX
-alone, compiled in the same round: seconds differ between machines and with what else they do, ratios to the peer
-hardly. Ratios are of processor time, medians of the rounds.
+Every answer is a separate process, measured from its start to its end: import, tracing, compilation, run. "Cold" means
+an empty folder of programs, "kept" the programs that the cold process stored. The peer is a fixed program of JAX alone,
+compiled in the same round: seconds differ between machines and loads, ratios to the peer hardly. Ratios are of
+processor time, medians of the rounds.
 """
 
 import argparse
@@ -38,7 +38,7 @@ _DESIGN = (
     "device = vijax.Harvester(omega=10 * np.pi, s=0.006, A=3.0, V=1700.0)\n"
     "design = vijax.optimise(device, survey_points=128, starts=1, max_impacts=2)\n"
 )
-# A hundred loops one after another, each with a body of its own: what XLA makes of them grows with their number alone.
+# A hundred loops in sequence, each with its own body: XLA's work grows with their number alone.
 PEER = """
 import jax, jax.numpy as jnp
 def chain(x):
@@ -91,81 +91,82 @@ QUESTIONS = {
     "vijax.fit(times, sides, timing_error=1e-4, device=guess, unknown=('omega0', 'r'))",
     "average": "vijax.average(vijax.Harvester())",
     "optimise": "vijax.optimise(vijax.Harvester())",
-    "under_tolerances": _DESIGN + "vijax.under_tolerances(design.best, [vijax.Tolerance('omega0', 0.05)])",
+    "tolerance_statistics": _DESIGN + "vijax.tolerance_statistics(design.best, [vijax.Tolerance('omega0', 0.05)])",
     "surroundings": _DESIGN + "vijax.surroundings(design.best)",
-    "weigh_basins": _DESIGN + "vijax.weigh_basins(design)",
-    "design_plane": _DESIGN
-    + "vijax.design_plane(design.best, [vijax.Tolerance('omega0', 0.05), vijax.Tolerance('s', 0.05)])",
-    "design_extents": _DESIGN + "vijax.design_extents(design.best)",
-    "design_arrival": _DESIGN + "vijax.design_arrival(design.best)",
+    "maximise_basin_power": _DESIGN + "vijax.maximise_basin_power(design)",
+    "tolerance_plane": _DESIGN
+    + "vijax.tolerance_plane(design.best, [vijax.Tolerance('omega0', 0.05), vijax.Tolerance('s', 0.05)])",
+    "parameter_ranges": _DESIGN + "vijax.parameter_ranges(design.best)",
+    "arrival_statistics": _DESIGN + "vijax.arrival_statistics(design.best)",
 }
 
 
 class Answer(NamedTuple):
-    """What the process of an answer took: seconds on the clock, and of processors."""
+    """Seconds of an answer's process: elapsed time, and processor time."""
 
     clock: float
     processor: float
 
 
 def answer(code: str, folder: Path, tree: Path = HERE.parent) -> Answer:
-    """Run a program in a process of its own, with the user's caches in a folder.
+    """Run a program in a separate process, with the user's caches in a folder.
 
     Args:
         code: The program.
-        folder: Where programs are kept.
-        tree: The checkout whose sources it uses.
+        folder: Folder of the stored programs.
+        tree: The checkout with the sources.
 
     Raises:
-        RuntimeError: If it fails; the message is what it wrote.
+        RuntimeError: The program failed; the message is its output.
     """
-    # What this process was told of JAX is not what a user's process is told.
-    told = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "XLA_"))}
-    told |= {"XDG_CACHE_HOME": str(folder), "PYTHONPATH": str(tree)}
+    # Settings of JAX in this process must not reach the process of a user.
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "XLA_"))}
+    environment |= {"XDG_CACHE_HOME": str(folder), "PYTHONPATH": str(tree)}
     command = [sys.executable, "-c", code]
-    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    # Python looks for a module where it is started, before it looks anywhere else.
-    done = subprocess.run(command, cwd=tree, env=told, capture_output=True, text=True, check=False)
-    clock, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    # Python searches the working directory for modules first.
+    done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, check=False)
+    clock, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode:
         raise RuntimeError(f"a question must have an answer; got\n{done.stderr}")
     return Answer(clock, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
 
 
 def program(question: str) -> str:
-    """Write the program of a question."""
+    """Return the program of a question."""
     return f"import dataclasses, jax, numpy as np, vijax\n{QUESTIONS[question]}\n"
 
 
 def rounds(questions: list[str], count: int, tree: Path) -> Iterator[tuple[str, Answer, Answer, Answer]]:
-    """Ask every question in every round: the question, its cold and its kept answer, and the peer's of that moment."""
+    """Run every question in every round; yield it with its cold and kept answer and the peer's answer."""
     for _ in range(count):
         for question in questions:
             with tempfile.TemporaryDirectory() as folder:
                 cold = answer(program(question), Path(folder), tree)
-                kept = answer(program(question), Path(folder), tree)
-                yield question, cold, kept, answer(PEER, Path(folder), tree)
+                stored = answer(program(question), Path(folder), tree)
+                yield question, cold, stored, answer(PEER, Path(folder), tree)
 
 
 def main() -> None:
-    """Ask, and print."""
+    """Run the questions, and print their times."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only", nargs="+", choices=QUESTIONS, default=list(QUESTIONS), help="these questions")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--tree", type=Path, default=HERE.parent, help="the checkout whose sources are used")
-    given = parser.parse_args()
+    options = parser.parse_args()
 
-    found: dict[str, list[tuple[Answer, Answer, Answer]]] = {question: [] for question in given.only}
-    for question, *answers in rounds(given.only, given.rounds, given.tree.resolve()):
-        found[question].append((answers[0], answers[1], answers[2]))
+    answers_of: dict[str, list[tuple[Answer, Answer, Answer]]] = {question: [] for question in options.only}
+    for question, *answers in rounds(options.only, options.rounds, options.tree.resolve()):
+        answers_of[question].append((answers[0], answers[1], answers[2]))
     print(f"{os.cpu_count()} cores; seconds on the clock, and processor time as a multiple of the peer's")
-    for question, every in found.items():
-        cold, kept = (statistics.median(answers[which].clock for answers in every) for which in (0, 1))
+    for question, answer_list in answers_of.items():
+        cold, stored = (statistics.median(answers[index].clock for answers in answer_list) for index in (0, 1))
         ratios = [
-            statistics.median(answers[which].processor / answers[2].processor for answers in every) for which in (0, 1)
+            statistics.median(answers[index].processor / answers[2].processor for answers in answer_list)
+            for index in (0, 1)
         ]
-        print(f"{question:27} cold {cold:6.2f} s {ratios[0]:6.2f}     kept {kept:6.2f} s {ratios[1]:6.2f}")
-    peers = [answers[2].clock for every in found.values() for answers in every]
+        print(f"{question:27} cold {cold:6.2f} s {ratios[0]:6.2f}     kept {stored:6.2f} s {ratios[1]:6.2f}")
+    peers = [answers[2].clock for answer_list in answers_of.values() for answers in answer_list]
     print(f"{'peer':27} cold {statistics.median(peers):6.2f} s")
 
 

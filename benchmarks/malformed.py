@@ -1,6 +1,6 @@
-"""Malformed calls, from tables: a door, one of its arguments, values that it must refuse.
+"""Malformed calls, from tables: a public function, one of its arguments, and values that it must reject.
 
-Building a case runs nothing; every case is alone with its mistake, all else in it being right and small.
+Building a case runs nothing. Every case has exactly one mistake; all its other arguments are valid and small.
 """
 
 import math
@@ -15,45 +15,32 @@ import numpy as np
 import xarray as xr
 
 import vijax
-from vijax.batch import simulate
+from vijax.continuation import branch_continuation, branch_dataset, branch_events, branch_switching, limits
+from vijax.continuation.curves import curve_table, curves, orbit_curves
+from vijax.continuation.from_map import map_curves
 from vijax.design import optimise, optimum, report
-from vijax.design.report_lines import lines, table
-from vijax.design.robustness import surroundings, weighted
-from vijax.design.tolerance import Tolerance, nodes
-from vijax.design.tolerance_plane import tolerance_plane
+from vijax.design.report_lines import format_report, format_table
+from vijax.design.robustness.surroundings import maximise_basin_power, surroundings
+from vijax.design.robustness.tolerance import Tolerance, nodes
+from vijax.design.robustness.tolerance_plane import tolerance_plane
+from vijax.maps.compare import cheapest_model
 from vijax.model import device
-from vijax.orbits import (
-    branch_dataset,
-    continuation,
-    curve_rows,
-    curves,
-    events,
-    limits,
-    map_curves,
-    motion,
-    orbit_curves,
-    orbit_properties,
-    orbit_search,
-    periodic,
-    shooting,
-    switching,
-    symmetry,
-)
-from vijax.planes.compare import cheapest_model
+from vijax.orbits import motion, orbit_properties, orbit_search, periodic, shooting, symmetry
 from vijax.plots import branch_diagrams, designs, kind_maps, number_maps, orbit_diagrams
+from vijax.simulation import simulate
 
 NAN, INF, HUGE = math.nan, math.inf, 10**45
 
 
 class Case(NamedTuple):
-    """One mistake: how it reads, which arguments its message must name, and how it is made."""
+    """One mistake: its text, the arguments that the message must name, and a function that makes the call."""
 
     text: str
     names: tuple[str, ...]
     make: Callable[[], Any]
 
 
-# --- what calls are made of ------------------------------------------------------------------------------------------
+# --- valid arguments -------------------------------------------------------------------------------------------------
 
 
 def pair() -> vijax.ImpactPair:
@@ -62,12 +49,12 @@ def pair() -> vijax.ImpactPair:
 
 
 def an_orbit() -> periodic.Orbit:
-    """Make a record such as a search returns, by hand so that nothing is compiled."""
+    """Return a record as a search returns it, made by hand so that nothing is compiled."""
     sequence = shooting.Sequence(jnp.array([[1, -1]], jnp.int32), jnp.array([2.0]), jnp.array([False]))
     wide = vijax.impact_pair([0.2], [40.0], [0.5])
-    knots, two = jnp.array([[[0.1, 0.5, 0.05], [1.1, 0.5, 0.05]]]), jnp.full((1, 2), 0.01)
+    impact_unknowns, two = jnp.array([[[0.1, 0.5, 0.05], [1.1, 0.5, 0.05]]]), jnp.full((1, 2), 0.01)
     multipliers, zero = jnp.full((1, 2), 0.1 + 0j), jnp.zeros(1)
-    return periodic.Orbit(wide, sequence, knots, two, two, multipliers, zero, jnp.zeros(1, jnp.int32))
+    return periodic.Orbit(wide, sequence, impact_unknowns, two, two, multipliers, zero, jnp.zeros(1, jnp.int32))
 
 
 def a_design() -> optimise.Design:
@@ -76,11 +63,11 @@ def a_design() -> optimise.Design:
 
 
 def an_optimum() -> optimum.Optimum:
-    """Make an optimum of which no more than the orbit is known."""
+    """Return an optimum with no valid field but its orbit."""
     path = np.zeros((1, 1))
-    told: dict[str, Any] = {"values": {}, "gradient": {}, "active": (), "path": path, "heights": path[0]}
-    told |= {"device": vijax.Harvester(), "label": "1:1", "height": 0.0, "P": 0.0, "P_stderr": 0.0}
-    return optimum.Optimum(**told, stopped="maximum", orbit=an_orbit(), state=None, evaluations=0)
+    fields: dict[str, Any] = {"values": {}, "gradient": {}, "active": (), "path": path, "path_objective": path[0]}
+    fields |= {"device": vijax.Harvester(), "label": "1:1", "objective_value": 0.0, "P": 0.0, "P_stderr": 0.0}
+    return optimum.Optimum(**fields, stopped="maximum", orbit=an_orbit(), state=None, evaluations=0)
 
 
 def a_map() -> xr.Dataset:
@@ -89,17 +76,17 @@ def a_map() -> xr.Dataset:
 
 
 def a_plane() -> xr.Dataset:
-    """Make a map of two axes whose cells were not run."""
+    """Return a map of two axes without computed cells."""
     axes = {"d": [0.1, 0.2], "kappa": [3.0, 40.0]}
-    still = {"r": 0.5, "gamma": 0.0, "omega": 6.0, "A": 1.0, "u0": 0.05, "v0": -0.4}
-    return xr.Dataset({"status": (("d", "kappa"), np.zeros((2, 2), int))}, coords=axes | still)
+    constants = {"r": 0.5, "gamma": 0.0, "omega": 6.0, "A": 1.0, "u0": 0.05, "v0": -0.4}
+    return xr.Dataset({"status": (("d", "kappa"), np.zeros((2, 2), int))}, coords=axes | constants)
 
 
 # --- kinds of bad values ---------------------------------------------------------------------------------------------
 
-# 0 and -1 stand apart, as some counts may be 0.
-WHOLE = (True, 1.5, NAN, "3", [3], 3j, -1, HUGE)
-COUNT = (*WHOLE, 0)
+# Counts that may be 0 have their own group.
+INTEGER = (True, 1.5, NAN, "3", [3], 3j, -1, HUGE)
+COUNT = (*INTEGER, 0)
 REAL = (True, "0.5", NAN, [0.1, 0.2], 1j, {}, -INF)
 NUMBERS = ("0.1", [], NAN, INF, True, 1j, object(), [0.1, "x"], {"a": 1}, math.sin, np.array([]))
 AXIS = (*NUMBERS, [[0.1]])
@@ -118,7 +105,7 @@ CELL = {"d": 0.2, "kappa": 40.0}
 
 Table = dict[str, tuple[Callable[..., Any], dict[str, Any], dict[str, tuple[Any, ...]]]]
 
-# Door: what is called, what is right in it, and which values of which argument are not.
+# By name of the function: the function, its valid arguments, and invalid values by argument.
 CALLS: Table = {
     "sweep": (
         vijax.sweep,
@@ -133,7 +120,7 @@ CALLS: Table = {
             "omega": (0, "pi", []),
             "A": (-1, "1 g"),
             "periods": COUNT,
-            "transient": WHOLE,
+            "transient": INTEGER,
             "wall": CHOICE,
             "until": CHOICE,
             "method": CHOICE,
@@ -144,7 +131,7 @@ CALLS: Table = {
             "out": TARGET,
             "overwrite": FLAG,
             "workers": (2,),
-            "refine": (*WHOLE, 0, 9),
+            "refine": (*INTEGER, 0, 9),
             "steps": (100,),
             "solver": ("Tsit5",),
             "membrane": ("hertz", 0.5),
@@ -209,7 +196,7 @@ CALLS: Table = {
     "lyapunov": (
         vijax.lyapunov,
         CELL,
-        {"starts": (*COUNT, 1), "periods": COUNT, "transient": WHOLE, "device": DEVICE, "progress": FUNCTION},
+        {"starts": (*COUNT, 1), "periods": COUNT, "transient": INTEGER, "device": DEVICE, "progress": FUNCTION},
     ),
     "survival": (
         vijax.survival,
@@ -273,7 +260,7 @@ CALLS: Table = {
     ),
     "optimise_all": (optimise.optimise_all, {}, {"devices": (3, [], [3], "paper", None, vijax.Harvester())}),
     "under": (
-        optimise.under,
+        optimise.tolerance_statistics,
         {"optimum": an_optimum(), "tolerances": [Tolerance("omega0", 0.05)]},
         {
             "optimum": (3, None, "best", a_design()),
@@ -347,8 +334,8 @@ CALLS: Table = {
         {"dataset": a_map(), "path": "map.zarr"},
         {"dataset": DATASET, "path": (*TARGET, None), "overwrite": FLAG},
     ),
-    "orbit_search.search": (
-        orbit_search.search,
+    "orbit_search.find_orbits": (
+        orbit_search.find_orbits,
         {"pair": pair(), "impacts": "1:1"},
         {
             "pair": (*PAIR, vijax.impact_pair([0.2, 0.3], 40.0, 0.5)),
@@ -358,8 +345,8 @@ CALLS: Table = {
             "seed": SEED,
         },
     ),
-    "orbit_search.from_state": (
-        orbit_search.from_state,
+    "orbit_search.orbits_from_states": (
+        orbit_search.orbits_from_states,
         {"pair": pair(), "u": 0.05, "v": -0.4},
         {
             "pair": PAIR,
@@ -367,11 +354,11 @@ CALLS: Table = {
             "v": (*START, None),
             "t": (*START, -1.0, 2.0),
             "period": (*COUNT, 10**9),
-            "settle": WHOLE,
+            "settle": INTEGER,
         },
     ),
-    "orbit_search.from_state beyond a rigid wall": (
-        orbit_search.from_state,
+    "orbit_search.orbits_from_states beyond a rigid wall": (
+        orbit_search.orbits_from_states,
         {"pair": vijax.impact_pair(0.2, None, 0.5), "v": 0.0},
         {"u": (0.2, -0.11, [0.0, 5.0])},
     ),
@@ -392,38 +379,42 @@ CALLS: Table = {
             "device": (*DEVICE, None),
             "periods": COUNT,
             "until": CHOICE,
-            "transient": WHOLE,
+            "transient": INTEGER,
             "outputs": (3, ["Q"], None),
             "method": ("ode", 3),
-            "count": (*WHOLE, 2),
+            "count": (*INTEGER, 2),
             "on": ("cpu", 0, []),
         },
     ),
     "periodic.solve": (
         periodic.solve,
-        {"pair": an_orbit().pair, "sequence": an_orbit().sequence, "knots": an_orbit().knots},
-        {"pair": PAIR, "sequence": ("RL", None, [1, -1]), "knots": ("x", None, [], 3.0)},
+        {"pair": an_orbit().pair, "sequence": an_orbit().sequence, "impact_unknowns": an_orbit().impact_unknowns},
+        {"pair": PAIR, "sequence": ("RL", None, [1, -1]), "impact_unknowns": ("x", None, [], 3.0)},
     ),
     **{
-        f"orbit.{door.__name__}": (door, {}, {"orbit": ORBIT})
-        for door in (
-            symmetry.symmetric,
-            symmetry.halved,
-            symmetry.doubled,
-            symmetry.unfolded,
+        f"orbit.{function.__name__}": (function, {}, {"orbit": ORBIT})
+        for function in (
+            symmetry.is_symmetric,
+            symmetry.close_half_way,
+            symmetry.double,
+            symmetry.unfold,
             orbit_properties.counts,
-            orbit_properties.labels,
+            orbit_properties.orbit_labels,
         )
     },
-    "orbit_properties.impacts": (orbit_properties.impacts, {}, {"orbit": ORBIT}),
-    "orbit_properties.power": (
-        orbit_properties.power,
+    "orbit_properties.orbit_impacts": (orbit_properties.orbit_impacts, {}, {"orbit": ORBIT}),
+    "orbit_properties.orbit_power": (
+        orbit_properties.orbit_power,
         {"orbit": an_orbit(), "device": vijax.Harvester()},
         {"orbit": ORBIT, "device": (*DEVICE, None)},
     ),
-    "orbit_properties.path": (orbit_properties.path, {"orbit": an_orbit()}, {"orbit": ORBIT, "samples": COUNT}),
-    "continuation.follow": (
-        continuation.follow,
+    "orbit_properties.orbit_path": (
+        orbit_properties.orbit_path,
+        {"orbit": an_orbit()},
+        {"orbit": ORBIT, "samples": COUNT},
+    ),
+    "continuation.follow_orbits": (
+        branch_continuation.follow_orbits,
         {"orbit": an_orbit(), "along": "d", "within": (0.1, 0.3)},
         {
             "orbit": ORBIT,
@@ -435,8 +426,8 @@ CALLS: Table = {
             "settings": (3, None, {"max_step": 0.02}),
         },
     ),
-    "switching.family": (
-        switching.family,
+    "switching.follow_families": (
+        branch_switching.follow_families,
         {"orbit": an_orbit(), "along": "d", "within": (0.1, 0.3)},
         {
             "orbit": ORBIT,
@@ -448,11 +439,11 @@ CALLS: Table = {
             "settings": (3, None),
         },
     ),
-    "switching.switch": (
-        switching.switch,
-        {"point": events.Point("flip", 0.2, an_orbit()), "along": "d", "within": (0.1, 0.3)},
+    "switching.switch_branch": (
+        branch_switching.switch_branch,
+        {"point": branch_events.Point("flip", 0.2, an_orbit()), "along": "d", "within": (0.1, 0.3)},
         {
-            "point": (3, None, "flip", events.Point("fold", 0.2, an_orbit())),
+            "point": (3, None, "flip", branch_events.Point("fold", 0.2, an_orbit())),
             "along": (3, "mass"),
             "within": (3, (0.3, 0.1)),
             "points": (0, 1.5, 10**9),
@@ -461,7 +452,7 @@ CALLS: Table = {
     "curves.follow_curves": (
         curves.follow_curves,
         {
-            "points": [events.Point("fold", 0.2, an_orbit())],
+            "points": [branch_events.Point("fold", 0.2, an_orbit())],
             "along": "d",
             "within": {"d": (0.1, 0.3), "kappa": (3, 400)},
         },
@@ -479,7 +470,7 @@ CALLS: Table = {
         {"dataset": a_map()},
         {
             "dataset": (*DATASET, a_map()),
-            "max_rounds": WHOLE,
+            "max_rounds": INTEGER,
             "max_seconds": (*REAL, 0, -1),
             "round_borders": COUNT,
             "max_points": (*COUNT, 1),
@@ -496,7 +487,7 @@ CALLS: Table = {
             "max_points": (*COUNT, 1),
         },
     ),
-    "design_plane": (
+    "tolerance_plane": (
         tolerance_plane,
         {"optimum": an_optimum(), "tolerances": [Tolerance("omega0", 0.05), Tolerance("s", 0.02)]},
         {
@@ -504,8 +495,8 @@ CALLS: Table = {
             "tolerances": (3, [3], [Tolerance("s", 0.1)], [Tolerance("s", 0.1), Tolerance("V", 0.1)]),
         },
     ),
-    "curve_rows": (curve_rows.curve_rows, {}, {"dataset": (*DATASET, a_map())}),
-    "branch_dataset.dataset": (branch_dataset.dataset, {}, {"branches": (3, None, [], ["d"], "d")}),
+    "curve_rows": (curve_table.curve_rows, {}, {"dataset": (*DATASET, a_map())}),
+    "branch_dataset.branch_dataset": (branch_dataset.branch_dataset, {}, {"branches": (3, None, [], ["d"], "d")}),
     "surroundings": (
         surroundings,
         {"optimum": an_optimum()},
@@ -516,8 +507,8 @@ CALLS: Table = {
             "seed": SEED,
         },
     ),
-    "weighted": (
-        weighted,
+    "maximise_basin_power": (
+        maximise_basin_power,
         {"design": a_design()},
         {
             "design": (3, None, "best"),
@@ -532,18 +523,22 @@ CALLS: Table = {
         {"design": a_design()},
         {"design": (3, None, "best"), "surroundings": (3, "all"), "diagram": (3, a_map()), "tolerances": (3, [3])},
     ),
-    "report_lines.lines": (lambda report: next(lines(report)), {}, {"report": (3, None, "best", a_design(), {})}),
-    "report_lines.table": (lambda report: next(table(report)), {}, {"report": (3, None, "best")}),
+    "report_lines.format_report": (
+        lambda report: next(format_report(report)),
+        {},
+        {"report": (3, None, "best", a_design(), {})},
+    ),
+    "report_lines.format_table": (lambda report: next(format_table(report)), {}, {"report": (3, None, "best")}),
     "designs.design": (
         designs.design,
         {"diagram": a_map(), "report": {"best": None}},
         {"diagram": (*DATASET, a_map())},
     ),
     "designs.design_map": (designs.design_map, {}, {"report": (3, None, "best")}),
-    "report.optimum": (report.optimum, {}, {"one": (3, None, "best")}),
+    "report.describe_optimum": (report.describe_optimum, {}, {"optimum": (3, None, "best")}),
     **{
-        f"plot.{door.__name__}": (door, {"dataset": a_map()}, {"dataset": DATASET})
-        for door in (
+        f"plot.{function.__name__}": (function, {"dataset": a_map()}, {"dataset": DATASET})
+        for function in (
             number_maps.power_map,
             kind_maps.label_map,
             kind_maps.basin_map,
@@ -603,10 +598,10 @@ CALLS: Table = {
 }
 
 
-# Made here, as whatever is made while a call is traced is traced too.
+# Made in advance, as objects created while a call is traced would be traced too.
 _PAIR, _ORBIT = pair(), an_orbit()
 
-# What is only differentiated by mistake: the door, and an argument of it that is traced.
+# Functions that are not differentiable: the traced argument and the call.
 TRACED: dict[str, Callable[[Any], Any]] = {
     "d of sweep": lambda x: vijax.sweep(d=x, kappa=40.0),
     "r of sweep": lambda x: vijax.sweep(**CELL, r=x),
@@ -620,13 +615,13 @@ TRACED: dict[str, Callable[[Any], Any]] = {
     "kappa of orbit_diagram": lambda x: vijax.orbit_diagram(along="d", values=[0.1, 0.2], kappa=x),
     "device of optimise": lambda x: vijax.optimise(vijax.Harvester(s=x)),
     "bounds of optimise": lambda x: vijax.optimise(bounds={"omega0": (20.0, x)}),
-    "pair of search": lambda x: orbit_search.search(vijax.impact_pair(x, 40.0, 0.5), "1:1"),
-    "u of from_state": lambda x: orbit_search.from_state(_PAIR, x, 0.1),
-    "within of follow": lambda x: continuation.follow(_ORBIT, "d", (0.1, x)),
-    "reach of surroundings": lambda x: weighted(a_design(), reach=x),
+    "pair of search": lambda x: orbit_search.find_orbits(vijax.impact_pair(x, 40.0, 0.5), "1:1"),
+    "u of orbits_from_states": lambda x: orbit_search.orbits_from_states(_PAIR, x, 0.1),
+    "within of follow": lambda x: branch_continuation.follow_orbits(_ORBIT, "d", (0.1, x)),
+    "reach of surroundings": lambda x: maximise_basin_power(a_design(), reach=x),
 }
 
-# Calls that miss an argument, or have one too many.
+# Calls with a missing or superfluous argument.
 SHAPES: dict[str, Callable[[], Any]] = {
     "kapa of sweep": lambda: vijax.sweep(kapa=3.0),
     "progres of sweep": lambda: vijax.sweep(**CELL, progres=print),
@@ -641,7 +636,7 @@ SHAPES: dict[str, Callable[[], Any]] = {
     "gamma of with_pair": lambda: device.with_pair(vijax.Harvester(), vijax.impact_pair(0.2, 40.0, 0.5, 20.0)),
     "d and kappa of other shapes": lambda: vijax.impact_pair([0.1, 0.2], [1.0, 2.0, 3.0], 0.5),
     "u0 and v0 of other shapes": lambda: vijax.trajectory(pair(), [0.0, 0.1], [0.1, 0.2, 0.3], 4),
-    "u and v of other shapes": lambda: orbit_search.from_state(pair(), [0.0, 0.1], [0.1, 0.2, 0.3]),
+    "u and v of other shapes": lambda: orbit_search.orbits_from_states(pair(), [0.0, 0.1], [0.1, 0.2, 0.3]),
     "r with Hunt-Crossley": lambda: vijax.trajectory(
         pair(), 0.05, -0.4, 4, method="ode", membrane=vijax.HuntCrossley(0.5)
     ),
@@ -649,10 +644,10 @@ SHAPES: dict[str, Callable[[], Any]] = {
     "mass of Harvester": lambda: vijax.Harvester(mass=1.0),
     "V of optimise": lambda: vijax.optimise(vijax.Harvester(V=0.0)),
     "device of several": lambda: vijax.optimise(vijax.Harvester(s=np.array([0.1, 0.2]))),
-    "kappa of a rigid wall": lambda: continuation.follow(rigid_orbit(), "kappa", (3.0, 40.0)),
+    "kappa of a rigid wall": lambda: branch_continuation.follow_orbits(rigid_orbit(), "kappa", (3.0, 40.0)),
 }
 
-# More than any machine holds, or would finish.
+# More than any machine can hold or finish.
 LARGE: dict[str, Callable[[], Any]] = {
     "d and kappa of 10^12 cells": lambda: vijax.sweep(d=np.linspace(0.1, 0.3, 10**6), kappa=np.linspace(3, 40, 10**6)),
     "omega and omega0 of 10^12 cells": lambda: vijax.sweep(
@@ -672,9 +667,9 @@ LARGE: dict[str, Callable[[], Any]] = {
     ),
     "periods of 10^9 recorded": lambda: vijax.trajectory(pair(), 0.05, -0.4, 10**9),
     "periods of 10^8 and u0 of many": lambda: vijax.trajectory(pair(), np.zeros(10**4), -0.4, 10**7),
-    "samples of 10^9": lambda: orbit_properties.path(an_orbit(), 10**9),
-    "guesses of 5005 sequences": lambda: orbit_search.search(pair(), "6:9", guesses=10**7),
-    "points of 10^9": lambda: continuation.follow(an_orbit(), "d", (0.1, 0.3), points=10**9),
+    "samples of 10^9": lambda: orbit_properties.orbit_path(an_orbit(), 10**9),
+    "guesses of 5005 sequences": lambda: orbit_search.find_orbits(pair(), "6:9", guesses=10**7),
+    "points of 10^9": lambda: branch_continuation.follow_orbits(an_orbit(), "d", (0.1, 0.3), points=10**9),
     "survey_points and starts of 10^12": lambda: vijax.optimise(survey_points=10**6, starts=10**6),
     "samples of optimise": lambda: vijax.optimise(
         objective="mean", tolerances=[Tolerance("omega0", 0.05)], samples=10**12
@@ -691,11 +686,11 @@ def rigid_orbit() -> periodic.Orbit:
 
 def calls() -> Iterator[Case]:
     """Yield the malformed calls."""
-    for door, (function, right, wrong) in CALLS.items():
-        for argument, values in wrong.items():
+    for function_name, (function, valid, invalid) in CALLS.items():
+        for argument, values in invalid.items():
             for value in values:
-                make = partial(function, **(right | {argument: value}))
-                yield Case(f"{door}({argument}={_short(value)})", (argument,), make)
+                make = partial(function, **(valid | {argument: value}))
+                yield Case(f"{function_name}({argument}={_short(value)})", (argument,), make)
     for text, traced in TRACED.items():
         yield Case(f"traced: {text}", _names(text), partial(jax.eval_shape, traced, 0.2))
     for text, make in (SHAPES | LARGE).items():
@@ -703,11 +698,11 @@ def calls() -> Iterator[Case]:
 
 
 def _names(text: str) -> tuple[str, ...]:
-    """Name the arguments that a text begins with: "d and s of sweep"."""
+    """Return the argument names at the beginning of a text: "d and s of sweep"."""
     words = text.split()
     return (words[0], words[2]) if words[1] == "and" else (words[0],)
 
 
 def _short(value: Any) -> str:
-    # Without addresses, which no two processes share.
+    # Without addresses, which differ between processes.
     return re.sub(r" at 0x[0-9a-f]+", "", " ".join(repr(value).split()))[:60]

@@ -1,4 +1,4 @@
-"""Malformed command lines, from tables: a script, one of its options, texts that it must refuse."""
+"""Malformed command lines, from tables: a script, one of its options, and texts that it must reject."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -6,7 +6,7 @@ from importlib import import_module
 
 from benchmarks.malformed import HUGE, Case
 
-# Texts of an axis that are none, and of axes that run away.
+# Invalid texts of an axis, and axes of excessive size.
 VALUES = (
     *("", "x", "1,,2", "0.1;0.2", "nan", "1,inf", "1e999", "@", "@nowhere", "@.", "@/dev/zero", "@/dev/null"),
     *("1:2", ":::", "1:2:0", "1:2:-3", "1:2:2.5", "1:2:1e3", "0.1:0.3:100000000", "0.1:0.3:1000000000000"),
@@ -24,7 +24,8 @@ PLOT = ("", ".", "map", "map.doc", "nowhere/map.png", "/proc/map.png", "/dev/nul
 _SMALL = ("--d", "0.1:0.2:3", "--kappa", "10:20:3")
 Lines = dict[str, tuple[tuple[str, ...], dict[str, tuple[str, ...]]]]
 
-# Script: what is right in a line, and which texts of which option are not; after it, what else the error may name.
+# By script: the valid part of a line, and invalid texts by option; an option's second word may replace its name in the
+# error.
 LINES: Lines = {
     "grid": (
         (*_SMALL, "--periods", "40"),
@@ -228,7 +229,7 @@ LINES: Lines = {
         },
     ),
 }
-# Lines of another shape: a script, its arguments, what the error must name.
+# Lines of another form: a script, its arguments, and the name in the error.
 SHAPES = (
     ("grid", ("--d",), "d"),
     ("grid", ("map.zarr",), "map.zarr"),
@@ -262,9 +263,9 @@ SHAPES = (
     ("paper", (), "figure"),
     ("paper", ("--figure",), "figure"),
 )
-# Script: the subcommand that it is a door to, which has to refuse the same.
+# By script: the equivalent subcommand, which must reject the same texts.
 _PAGES = {"grid": "sweep", "orbit_diagram": "orbit-diagram", "basins": "basins", "branch": "branch", "design": "design"}
-# Lines of the command alone: its arguments, what the error must name.
+# Lines of the command alone: its arguments, and the name in the error.
 COMMANDS = (
     (("swep",), "swep"),
     (("grid",), "grid"),
@@ -280,13 +281,13 @@ COMMANDS = (
     (("orbit-diagram", "--direction"), "direction"),
     (("orbit_diagram",), "orbit_diagram"),
 )
-# What a line needs besides, so that the option is looked at.
+# Further arguments of a line, without which the option is not read.
 _WITH = {"into": ("--figure", "3")}
 _MODULES = {"paper": "paper.__main__"}
 
 
 def lines() -> Iterator[Case]:
-    """Yield the malformed command lines, each run in the folder of the moment."""
+    """Yield the malformed command lines, each run in the current folder."""
     for script, arguments, name in (*_of_tables(), *SHAPES):
         yield Case(_short(script, *arguments), (name,), partial(_run, script, arguments))
     for arguments, name in (*_of_pages(), *COMMANDS):
@@ -294,24 +295,24 @@ def lines() -> Iterator[Case]:
 
 
 def _short(*words: str) -> str:
-    """Shorten a line, to read at a glance."""
+    """Shorten a line for display."""
     line = " ".join(words)
     return line if len(line) <= 100 else f"{line[:35]} ... {line[-60:]}"
 
 
 def _of_tables() -> Iterator[tuple[str, tuple[str, ...], str]]:
-    """Yield a script, its arguments, what the error must name."""
-    for door, (right, wrong) in LINES.items():
-        for option, texts in wrong.items():
+    """Yield a script, its arguments, and the name in the error."""
+    for title, (valid, invalid) in LINES.items():
+        for option, texts in invalid.items():
             words = option.split()
             for text in texts:
-                yield door.split()[0], (*right, *_WITH.get(option, ()), f"--{words[0]}={text}"), words[-1]
+                yield title.split()[0], (*valid, *_WITH.get(option, ()), f"--{words[0]}={text}"), words[-1]
 
 
 def _of_pages() -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield the same of the command: a subcommand and its arguments, what the error must name."""
+    """Yield the same lines for the command: a subcommand and its arguments, and the name in the error."""
     for script, arguments, name in (*_of_tables(), *SHAPES):
-        if "--compare" in arguments:  # a subcommand of its own
+        if "--compare" in arguments:  # this is a separate subcommand
             at = arguments.index("--compare")
             yield ("compare", *arguments[:at], *arguments[at + 2 :]), name
         elif script in _PAGES:
@@ -319,7 +320,7 @@ def _of_pages() -> Iterator[tuple[tuple[str, ...], str]]:
 
 
 def _run(script: str, arguments: tuple[str, ...]) -> int:
-    """Run a script, or the command, in this process; give its exit code."""
+    """Run a script, or the command, in this process; return its exit code."""
     from vijax.cli import main, process
 
     if script == "vijax":

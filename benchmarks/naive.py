@@ -1,6 +1,6 @@
-"""The obvious ways to do it, each a few lines as its users write them, that `failures.py` shows to fail.
+"""Straightforward implementations, each a few lines as users would write them; `failures.py` shows that they fail.
 
-All take the pair of Eq. (38) at gamma = 0 with start at phase 0, and none knows more of the wall than its line says.
+All use the pair of Eq. (38) at gamma = 0 with a start at phase 0, and treat the wall only as their docstring states.
 """
 
 import math
@@ -19,7 +19,7 @@ PERIOD = 2.0
 
 
 def push(t: Any, u: Any, v: Any, d: Any, kappa: Any, r: Any) -> Any:
-    """Compute u'' with the contact decided by a `where`; automatic differentiation does not see where it switches."""
+    """Return u'' with the contact decided by a `where`; automatic differentiation does not see the switching time."""
     log = jnp.log(r)
     mu = -2 * kappa * log / jnp.sqrt(math.pi**2 + log * log)
     side = jnp.where(u < 0, -1.0, 1.0)
@@ -29,7 +29,7 @@ def push(t: Any, u: Any, v: Any, d: Any, kappa: Any, r: Any) -> Any:
 
 @jax.jit
 def where_rk4(d: Any, kappa: Any, r: Any, u0: Any, v0: Any, periods: Any, steps: Any) -> tuple[Any, Any]:
-    """Find displacement after some periods by classical Runge-Kutta, and its derivative by kappa through a `where`."""
+    """Return displacement after some periods by classical Runge-Kutta, and its kappa derivative through a `where`."""
     h = PERIOD / jnp.asarray(steps, kappa.dtype)
 
     def last(kappa):
@@ -52,7 +52,7 @@ def where_rk4(d: Any, kappa: Any, r: Any, u0: Any, v0: Any, periods: Any, steps:
 
 
 def where_solver(solver: str, d: Any, kappa: Any, r: float, u0: float, v0: float, periods: int) -> Callable[[int], Any]:
-    """Find displacement [N] after some periods by an explicit solver of diffrax, so many steps a period; no events."""
+    """Return a function of the steps per period to the displacement [N], by a diffrax solver without events."""
     numbers = jnp.asarray(d), jnp.asarray(r)
 
     def field(t, y, kappa):
@@ -79,7 +79,7 @@ def where_solver(solver: str, d: Any, kappa: Any, r: float, u0: float, v0: float
 @jax.jit
 @jax.vmap
 def event_solver(d: Any, u0: Any, v0: Any) -> Any:
-    """Find when the first impact is, [N], by diffrax's event and Newton's root-find; inf for none in two periods."""
+    """Return the time of the first impact, [N], by diffrax's event and Newton root finder; inf after two periods."""
     done = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, _: jnp.stack([y[1], jnp.cos(math.pi * t)])),
         diffrax.Tsit5(),
@@ -95,7 +95,7 @@ def event_solver(d: Any, u0: Any, v0: Any) -> Any:
 
 
 class Chain(NamedTuple):
-    """How far a chain of restarts came."""
+    """End of a chain of restarts: time, number of restarts, solves without progress."""
 
     t: float
     restarts: int
@@ -103,12 +103,12 @@ class Chain(NamedTuple):
 
 
 def restart_chain(d: float, r: float, u0: float, v0: float, periods: int, restarts: int) -> Chain:
-    """Chain SciPy solves to a rigid wall, the velocity turned around, started again there, so many times at most."""
+    """Chain SciPy solves to a rigid wall, each with reversed velocity from the wall, up to a number of restarts."""
 
-    def room(t, y):
+    def clearance(t, y):
         return 0.5 * d - abs(y[0])
 
-    room.terminal, room.direction = True, -1  # type: ignore[attr-defined]
+    clearance.terminal, clearance.direction = True, -1  # type: ignore[attr-defined]
     t, y, still = 0.0, [u0, v0], 0
     for restart in range(restarts):
         run = solve_ivp(
@@ -118,7 +118,7 @@ def restart_chain(d: float, r: float, u0: float, v0: float, periods: int, restar
             method="DOP853",
             rtol=1e-9,
             atol=1e-11,
-            events=room,
+            events=clearance,
         )
         if run.status != 1:
             return Chain(float(run.t[-1]), restart, still)
@@ -128,7 +128,7 @@ def restart_chain(d: float, r: float, u0: float, v0: float, periods: int, restar
 
 
 def contact(kappa: Any, r: Any, speed: Any, s: Any, xp: Any = math) -> Any:
-    """Compute penetration a time s after an entry at phase 0, by the textbook's steady and free oscillations.
+    """Return penetration a time s after an entry at phase 0, by the textbook's steady and free oscillations.
 
     `xp` is a module with pi, log, exp, sqrt, sin and cos: `math`, or `mpmath` for the same formula in more digits.
     """

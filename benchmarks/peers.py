@@ -1,14 +1,14 @@
-"""What the engines are measured against: the usual programs for this job, each as its users would write it.
+"""Peers of the engines: common programs for this task, each as its users would write it.
 
-`rk4`: fixed steps on every cell, no event located: contact is a test on the position at each stage, an impact a sample
-inside the wall after one outside. As fast as numba allows: cells go in blocks whose inner loop the compiler turns into
-vector instructions, blocks go to threads, and all cells share one table of the forcing, since all start at one phase.
+`rk4`: fixed steps on every cell, no event located. Contact is a test on the position at each stage, an impact a sample
+inside the wall after one outside. As fast as numba allows: the inner loop over a block of cells becomes vector
+instructions, blocks run in threads, and all cells share one table of the forcing, as all start at one phase.
 
 `dormand_prince`: Dormand and Prince's adaptive pair in numba, events located by repeating the step up to them.
 
-`scipy_events`, `diffrax_chain`: a solver's own terminal events, and a restart behind each.
+`scipy_events`, `diffrax_chain`: a solver's own terminal events, and a restart after each.
 
-All start at phase 0 and end at phase 0, some periods later. Only the located ones know rigid walls (kappa None).
+All start and end at phase 0, some periods apart. Only those with located events support rigid walls (kappa None).
 """
 
 import math
@@ -23,9 +23,9 @@ import numpy as np
 import optimistix
 from scipy.integrate import solve_ivp
 
-LONGEST = 0.25  # of an adaptive step in flight: what enters and leaves a wall within it may be missed
-ATOL = 1e-2  # of rtol
-BLOCK = 16  # cells that advance together: two AVX-512 registers, and still in L1
+LONGEST = 0.25  # longest adaptive step in flight; an entry and an exit within one step may be missed
+ATOL = 1e-2  # absolute tolerance relative to rtol
+BLOCK = 16  # cells that advance together: two AVX-512 registers, and still in L1 cache
 
 
 def _damping(r: float) -> float:
@@ -54,10 +54,10 @@ def rk4_impacts_per_period(d, kappa, r: float, u0: float, v0: float, periods: in
 def rk4(
     d, kappa, r: float, u0, v0, periods: int, steps: int, gamma: float = 0.0, shaken=lambda t: np.cos(np.pi * t)
 ) -> tuple[np.ndarray, ...]:
-    """Count impacts per period, and find final displacement and final velocity, each [N].
+    """Return impacts per period, final displacement and final velocity, each [N].
 
-    Args of `rk4_impacts_per_period`, but that u0 and v0 may differ from cell to cell, that gamma is free, and that
-    `shaken` may be any forcing which repeats every period, as a function of times in [0, 2].
+    The arguments are as in `rk4_impacts_per_period`, but u0 and v0 may differ from cell to cell, gamma is free, and
+    `shaken` may be any forcing that repeats every period, as a function of times in [0, 2].
     """
     d, kappa, u0, v0 = np.broadcast_arrays(*(np.asarray(x, dtype=float) for x in (d, kappa, u0, v0)))
     padding = -d.size % BLOCK
@@ -73,7 +73,8 @@ def _march(half_gap, stiffness, damping, periods, steps, forcing, impacts_out, u
     h = 2.0 / steps
     for block in numba.prange(half_gap.size // BLOCK):
         first, last = block * BLOCK, (block + 1) * BLOCK
-        # Private copies: through the shared arrays the compiler must fear aliases and leaves the inner loop scalar.
+        # Private copies: with the shared arrays the compiler must assume aliases, and does not vectorise the inner
+        # loop.
         gap, stiff, damp = half_gap[first:last].copy(), stiffness[first:last].copy(), damping[first:last].copy()
         u, v = u_inout[first:last].copy(), v_inout[first:last].copy()
         impacts, inside = np.zeros(BLOCK), np.zeros(BLOCK)
@@ -105,7 +106,7 @@ def _march(half_gap, stiffness, damping, periods, steps, forcing, impacts_out, u
 
 # --- located events in numba ----------------------------------------------------------------------
 
-# The pair of Dormand and Prince: stages, their places, and the difference to the embedded fourth order.
+# The Dormand-Prince pair: stages, their nodes, and the difference to the embedded fourth order.
 _A = np.array(
     [
         [0, 0, 0, 0, 0, 0],
@@ -120,14 +121,14 @@ _A = np.array(
 _C = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1, 1])
 _E = np.array([71 / 57600, 0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
 
-_LOOKS = 4  # places of a step at which its cubic is compared with the wall
-_ROOT_ITERATIONS = 40  # Newton or bisection, each a repeated step
-_CLOSED = 4e-16  # distance to the wall that is none
-_STEPS_PER_PERIOD = 1_000_000  # a run that needs more has failed
+_PROBES = 4  # points of a step at which its cubic interpolant is compared with the wall
+_ROOT_ITERATIONS = 40  # iterations of Newton's method or bisection, each a repeated step
+_CLOSED = 4e-16  # distance to the wall that counts as zero
+_STEPS_PER_PERIOD = 1_000_000  # a run that needs more steps has failed
 
 
 def dormand_prince(d, kappa, r: float, gamma: float, u0, v0, periods: int, rtol: float) -> tuple[np.ndarray, ...]:
-    """Find displacement and velocity of every cell at last by an adaptive pair of order 5 with located events.
+    """Return the final displacement and velocity of every cell, by an adaptive pair of order 5 with located events.
 
     Args:
         d: gap, [N].
@@ -139,7 +140,7 @@ def dormand_prince(d, kappa, r: float, gamma: float, u0, v0, periods: int, rtol:
         rtol: tolerance relative to displacement and velocity; the absolute one is a hundredth.
 
     Returns:
-        Displacement and velocity, float64 [N]; NaN where a cell took too many steps.
+        Displacement and velocity, float64 [N]; NaN for a cell with too many steps.
     """
     stiff = 0.0 if kappa is None else kappa
     d, u0, v0, stiff = np.broadcast_arrays(*(np.asarray(x, dtype=float) for x in (d, u0, v0, stiff)))
@@ -150,8 +151,8 @@ def dormand_prince(d, kappa, r: float, gamma: float, u0, v0, periods: int, rtol:
 
 @numba.njit
 def _dormand_prince_step(t, u, v, h, side, half, stiffness, damping, gamma, speeds, pushes):
-    """Compute displacement and velocity after a step, and their error; side 0 is flight."""
-    held = abs(side)
+    """Return displacement and velocity after a step, and their error; side 0 is flight."""
+    in_contact = abs(side)
     u_new, v_new = u, v
     for i in range(7):
         u_new, v_new = u, v
@@ -160,7 +161,7 @@ def _dormand_prince_step(t, u, v, h, side, half, stiffness, damping, gamma, spee
             v_new += h * _A[i, j] * pushes[j]
         speeds[i] = v_new
         pushes[i] = math.cos(math.pi * (t + _C[i] * h)) - gamma
-        pushes[i] -= held * (stiffness * (u_new - side * half) + damping * v_new)
+        pushes[i] -= in_contact * (stiffness * (u_new - side * half) + damping * v_new)
     u_error = v_error = 0.0
     for i in range(7):
         u_error += h * _E[i] * speeds[i]
@@ -169,19 +170,19 @@ def _dormand_prince_step(t, u, v, h, side, half, stiffness, damping, gamma, spee
 
 
 @numba.njit
-def _beyond(u, side, half):
-    """Say how far the ball is past the next event: outside the gap in flight, inside it in contact."""
+def _violation(u, side, half):
+    """Return the distance past the next event: outside the gap in flight, inside it in contact."""
     return abs(u) - half if side == 0 else half - side * u
 
 
 @numba.njit
-def _first_look(u, v, u_new, v_new, h, side, half):
-    """Find the first place of a step, as a part of it, at which the ball is past an event; above 1 if there is none."""
-    for look in range(1, _LOOKS + 1):
-        s = look / _LOOKS
-        rise = u_new - u
-        place = u + s * (h * v + s * (3 * rise - h * (2 * v + v_new) + s * (h * (v + v_new) - 2 * rise)))
-        if _beyond(u_new if look == _LOOKS else place, side, half) > 0:
+def _first_violation(u, v, u_new, v_new, h, side, half):
+    """Return the first probed fraction of a step at which the ball is past an event; above 1 if there is none."""
+    for probe in range(1, _PROBES + 1):
+        s = probe / _PROBES
+        change = u_new - u
+        position = u + s * (h * v + s * (3 * change - h * (2 * v + v_new) + s * (h * (v + v_new) - 2 * change)))
+        if _violation(u_new if probe == _PROBES else position, side, half) > 0:
             return s
     return 2.0
 
@@ -194,12 +195,12 @@ def _chain(half_gap, stiffnesses, dampings, r, gamma, end, rtol, u_inout, v_inou
         speeds, pushes = np.empty(7), np.empty(7)
         flight = 1e-3
         contact = 0.1 / math.sqrt(stiffness) if stiffness > 0 else flight
-        left = int(_STEPS_PER_PERIOD * end)
-        while t < end and left > 0:
-            left -= 1
-            own = flight if side == 0 else contact
-            last = own >= end - t
-            h = end - t if last else own
+        remaining_steps = int(_STEPS_PER_PERIOD * end)
+        while t < end and remaining_steps > 0:
+            remaining_steps -= 1
+            step_size = flight if side == 0 else contact
+            last = step_size >= end - t
+            h = end - t if last else step_size
             step = _dormand_prince_step(t, u, v, h, side, half, stiffness, damping, gamma, speeds, pushes)
             u_new, v_new, u_error, v_error = step
             u_error /= rtol * (ATOL + max(abs(u), abs(u_new)))
@@ -211,31 +212,31 @@ def _chain(half_gap, stiffnesses, dampings, r, gamma, end, rtol, u_inout, v_inou
             elif not last:
                 h *= factor
             else:
-                h = own
+                h = step_size
             if side == 0:
                 flight = min(h, LONGEST)
             else:
                 contact = min(h, LONGEST)
             if not error <= 1:
                 continue
-            h = end - t if last else own
-            high = h * _first_look(u, v, u_new, v_new, h, side, half)
+            h = end - t if last else step_size
+            high = h * _first_violation(u, v, u_new, v_new, h, side, half)
             if high > h:
                 t = end if last else t + h
                 u, v = u_new, v_new
                 continue
-            low, s = high - h / _LOOKS, high - 0.5 * h / _LOOKS
+            low, s = high - h / _PROBES, high - 0.5 * h / _PROBES
             for _ in range(_ROOT_ITERATIONS):
                 step = _dormand_prince_step(t, u, v, s, side, half, stiffness, damping, gamma, speeds, pushes)
-                past = _beyond(step[0], side, half)
-                if abs(past) < _CLOSED:
+                violation = _violation(step[0], side, half)
+                if abs(violation) < _CLOSED:
                     break
-                if past > 0:
+                if violation > 0:
                     high = s
                 else:
                     low = s
                 rate = step[1] * (np.sign(step[0]) if side == 0 else -side)
-                s = s - past / rate if rate > 0 else low
+                s = s - violation / rate if rate > 0 else low
                 if not low < s < high:
                     s = 0.5 * (low + high)
             wall = side if side != 0 else (1 if step[0] > 0 else -1)
@@ -244,8 +245,8 @@ def _chain(half_gap, stiffnesses, dampings, r, gamma, end, rtol, u_inout, v_inou
                 v = -r * v
             else:
                 side = 0 if side != 0 else wall
-        u_inout[cell] = u if left > 0 else np.nan
-        v_inout[cell] = v if left > 0 else np.nan
+        u_inout[cell] = u if remaining_steps > 0 else np.nan
+        v_inout[cell] = v if remaining_steps > 0 else np.nan
 
 
 # --- restart chains -------------------------------------------------------------------------------
@@ -254,11 +255,11 @@ def _chain(half_gap, stiffnesses, dampings, r, gamma, end, rtol, u_inout, v_inou
 def scipy_events(
     d, kappa, r: float, gamma: float, u0, v0, periods: int, rtol: float, solver: str
 ) -> tuple[np.ndarray, ...]:
-    """Do as `dormand_prince`, by SciPy's `solve_ivp` with terminal events, cell by cell; NaN where it gives up."""
+    """Do the same as `dormand_prince` by SciPy's `solve_ivp` with terminal events, cell by cell; NaN if it fails."""
     cells = np.broadcast(d, 0.0 if kappa is None else kappa, u0, v0)
     ends = [
-        _scipy_cell(float(d), None if kappa is None else float(own), r, gamma, u, v, periods, rtol, solver)
-        for d, own, u, v in cells
+        _scipy_cell(float(d), None if kappa is None else float(stiffness), r, gamma, u, v, periods, rtol, solver)
+        for d, stiffness, u, v in cells
     ]
     u, v = np.array(ends).T
     return u, v
@@ -272,22 +273,24 @@ def _scipy_cell(d, kappa, r, gamma, u, v, periods, rtol, solver) -> tuple[float,
         force = math.cos(math.pi * t) - gamma
         return y[1], force - (stiffness * (y[0] - side * half) + damping * y[1] if side else 0.0)
 
-    def meets(wall, direction):
-        def gap(t, y):
+    def wall_event(wall, direction):
+        def distance(t, y):
             return y[0] - wall
 
-        gap.terminal, gap.direction = True, direction
-        return gap
+        distance.terminal, distance.direction = True, direction
+        return distance
 
-    onsets = [meets(half, 1), meets(-half, -1)]
+    onsets = [wall_event(half, 1), wall_event(-half, -1)]
     while t < end:
-        events = [meets(side * half, -side)] if side else onsets
-        found = solve_ivp(field, (t, end), (u, v), solver, events=events, max_step=LONGEST, rtol=rtol, atol=ATOL * rtol)
-        if not found.success:
+        events = [wall_event(side * half, -side)] if side else onsets
+        solution = solve_ivp(
+            field, (t, end), (u, v), solver, events=events, max_step=LONGEST, rtol=rtol, atol=ATOL * rtol
+        )
+        if not solution.success:
             return math.nan, math.nan
-        t, (u, v) = found.t[-1], found.y[:, -1]
-        if found.status == 1:
-            wall = side or (1 if len(found.t_events[0]) else -1)
+        t, (u, v) = solution.t[-1], solution.y[:, -1]
+        if solution.status == 1:
+            wall = side or (1 if len(solution.t_events[0]) else -1)
             u = wall * half
             if kappa is None:
                 v = -r * v
@@ -297,7 +300,7 @@ def _scipy_cell(d, kappa, r, gamma, u, v, periods, rtol, solver) -> tuple[float,
 
 
 def diffrax_chain(d, kappa, r: float, gamma: float, u0, v0, periods: int, rtol: float) -> tuple[np.ndarray, ...]:
-    """Do as `dormand_prince`, by diffrax: `diffeqsolve` with an `Event`, restarted to the end of the run, vmapped."""
+    """Do the same as `dormand_prince` by diffrax: `diffeqsolve` with an `Event`, restarted until the end, vmapped."""
     stiff = np.asarray(0.0 if kappa is None else kappa, dtype=float)
     d, u0, v0, stiff = np.broadcast_arrays(*(np.asarray(x, dtype=float) for x in (d, u0, v0)), stiff)
     cells = [jnp.asarray(x) for x in (d / 2, u0, v0, stiff**2, stiff * _damping(r))]
@@ -305,7 +308,7 @@ def diffrax_chain(d, kappa, r: float, gamma: float, u0, v0, periods: int, rtol: 
     return np.asarray(u), np.asarray(v)
 
 
-_MOST_STEPS = 1_000_000  # of one spell
+_MOST_STEPS = 1_000_000  # of one interval between events
 
 
 @lru_cache
@@ -315,14 +318,14 @@ def _restarts(rigid: bool) -> Any:
         pull = stiffness * (y[0] - side * half) + damping * y[1]
         return y[1], jnp.cos(jnp.pi * t) - gamma - jnp.where(side == 0, 0.0, pull)
 
-    def past(t, y, args, **_):
+    def violation(t, y, args, **_):
         half, side, *_ = args
         return jnp.where(side == 0, jnp.abs(y[0]) - half, half - side * y[0])
 
     def run(half, u0, v0, stiffness, damping, r, gamma, end, rtol):
-        def spell(carry):
+        def interval(carry):
             t, u, v, side = carry
-            found = diffrax.diffeqsolve(
+            solution = diffrax.diffeqsolve(
                 diffrax.ODETerm(field),
                 diffrax.Tsit5(),
                 t,
@@ -331,20 +334,20 @@ def _restarts(rigid: bool) -> Any:
                 (u, v),
                 (half, side, stiffness, damping, gamma),
                 stepsize_controller=diffrax.PIDController(rtol=rtol, atol=ATOL * rtol, dtmax=LONGEST),
-                event=diffrax.Event(past, optimistix.Newton(rtol, ATOL * rtol), direction=True),
+                event=diffrax.Event(violation, optimistix.Newton(rtol, ATOL * rtol), direction=True),
                 max_steps=_MOST_STEPS,
                 throw=False,
             )
-            t, (u, v) = found.ts[-1], (found.ys[0][-1], found.ys[1][-1])
-            met = found.event_mask
+            t, (u, v) = solution.ts[-1], (solution.ys[0][-1], solution.ys[1][-1])
+            hit = solution.event_mask
             wall = jnp.where(side == 0, jnp.sign(u), side)
-            u = jnp.where(met, wall * half, u)
+            u = jnp.where(hit, wall * half, u)
             if rigid:
-                return t, u, jnp.where(met, -r * v, v), side
-            return t, u, v, jnp.where(met, jnp.where(side == 0, wall, 0.0), side)
+                return t, u, jnp.where(hit, -r * v, v), side
+            return t, u, v, jnp.where(hit, jnp.where(side == 0, wall, 0.0), side)
 
         carry = (jnp.zeros_like(u0), u0, v0, jnp.zeros_like(u0))
-        _, u, v, _ = jax.lax.while_loop(lambda carry: carry[0] < end, spell, carry)
+        _, u, v, _ = jax.lax.while_loop(lambda carry: carry[0] < end, interval, carry)
         return u, v
 
     return jax.jit(jax.vmap(run, in_axes=(*[0] * 5, *[None] * 4)))

@@ -1,29 +1,30 @@
-"""What can a power cut do to a store, at any moment of writing it?
+"""Which states can a power cut leave of a store, at any moment of writing it?
 
-    python benchmarks/power_loss.py                 # every state of the model, each read and gone on with
-    python benchmarks/power_loss.py --most 100      # of every scenario so many states, drawn at random
+    python benchmarks/power_loss.py                 # every state of the model, each read and resumed
+    python benchmarks/power_loss.py --most 100      # a number of random states per scenario
 
-`disk_model` records the changes of the disk and states which of them a power cut may take. A scenario is replayed up to
-each of its changes. Of the changes that are not flushed by then there survive none, all, all up to one, all but one,
-one alone, or some at random, with whole, half or no contents.
+`disk_model` records the changes of the disk and defines which of them a power cut may undo. A scenario is replayed to
+each of its changes. Of the changes that are not flushed by then, none survive, all, all up to one, all but one, one
+alone, or some at random, with full, half or no contents.
 
-For every scenario the numbers of states, of those that `load` refused, and of those that broke a promise are printed:
+For every scenario it prints the numbers of states, of states that `load` rejects, and of states with a broken
+guarantee:
 
-- a map is there, whole, once `save` has returned; while `save` replaces a map the old or the new one is there, whole;
-- a tile that is done is read as it was written, and what is not there has the status `not_run`;
-- the same call goes on without --overwrite, runs no tile again that was done, and ends in the same map.
+- after `save` has returned a map exists completely; while `save` replaces a map, the old or the new one is complete;
+- a finished tile reads as it was written, and missing cells have the status `not_run`;
+- the same call resumes without --overwrite, repeats no finished tile, and ends with the same map.
 
 Exit code 1 if any is broken. Printout of `--most 40`, 20 cells in 4 tiles:
 
     where the disk can exchange two names:
         a study: 40 states, 4 refused, 0 broken
-        a study that mends damage: 40 states, 26 refused, 0 broken
+        a study that repairs damage: 40 states, 26 refused, 0 broken
         a study that replaces another: 40 states, 0 refused, 0 broken
         save: 40 states, 20 refused, 0 broken
         save that replaces a map: 40 states, 0 refused, 0 broken
     where the disk cannot exchange two names:
         a study: 40 states, 4 refused, 0 broken
-        a study that mends damage: 40 states, 26 refused, 0 broken
+        a study that repairs damage: 40 states, 26 refused, 0 broken
         a study that replaces another: 40 states, 0 refused, 0 broken
         save: 40 states, 20 refused, 0 broken
         save that replaces a map: 40 states, 0 refused, 0 broken
@@ -41,21 +42,21 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 import vijax
-from benchmarks.disk_model import Recording, State, lay_out, recorded, some_states, states, watched
+from benchmarks.disk_model import Recording, State, lay_out, random_states, recorded, states, watched
+from vijax.maps.storage import store_folder
 from vijax.model.records import Status
-from vijax.planes import store_folder
 
 if TYPE_CHECKING:
     import xarray as xr
 
-# --- what is promised ------------------------------------------------------------------------------------------------
+# --- guarantees ------------------------------------------------------------------------------------------------------
 
-WHOLE = "whole"
-"""The promise of a call that has returned."""
+RETURNED = "returned"
+"""Guarantee of a call that has returned."""
 
 AXES: dict[str, Any] = {"d": np.linspace(0.1, 0.3, 5), "kappa": np.geomspace(3, 400, 4)}
 NAME = "map.zarr"
-TILES = 6, 6, 4, 4  # cells of the tiles of the plane where a tile has six at most
+TILES = 6, 6, 4, 4  # cells per tile of the plane, if a tile has at most six
 
 
 def sweep(out: Path | None = None, **more: Any) -> "xr.Dataset":
@@ -64,15 +65,15 @@ def sweep(out: Path | None = None, **more: Any) -> "xr.Dataset":
 
 
 class Scenario(NamedTuple):
-    """Something that a power cut interrupts.
+    """A call that a power cut interrupts.
 
     Attributes:
-        before: Makes what is there before.
-        call: What is interrupted.
-        after: The maps that may be there afterwards; once all is done the last one.
-        study: Whether `call` may be repeated, and goes on then.
-        done: Tiles that are done before.
-        reads: Whether `load` must read what is there as soon as there is something.
+        before: Makes the initial state.
+        call: The interrupted call.
+        after: Maps that may exist afterwards; after completion the last one.
+        study: Whether `call` may be repeated, and then resumes.
+        done: Tiles that are finished before.
+        reads: Whether `load` must succeed as soon as any store exists.
     """
 
     before: Callable[[Path], Any] | None
@@ -84,7 +85,7 @@ class Scenario(NamedTuple):
 
 
 def scenarios() -> dict[str, Scenario]:
-    """Name what is interrupted."""
+    """Return the scenarios by name."""
     new, old = sweep().load(), sweep(r=0.4).load()
 
     def save(path: Path) -> None:
@@ -106,7 +107,7 @@ def scenarios() -> dict[str, Scenario]:
 
     return {
         "a study": Scenario(None, sweep, [new], True),
-        "a study that mends damage": Scenario(damage, sweep, [new], True, frozenset({1, 2, 3}), False),
+        "a study that repairs damage": Scenario(damage, sweep, [new], True, frozenset({1, 2, 3}), False),
         "a study that replaces another": Scenario(sweep_old, replace, [old, new], False),
         "save": Scenario(None, save, [new], False),
         "save that replaces a map": Scenario(save_old, save, [old, new], False),
@@ -119,99 +120,99 @@ def record(scenario: Scenario, folder: Path) -> Recording:
         scenario.before(folder / NAME)
     with recorded(folder) as recording:
         for tile in scenario.done:
-            recording.add("promise", str(tile))
+            recording.add("guarantee", str(tile))
         scenario.call(folder / NAME)
-        recording.add("promise", WHOLE)
+        recording.add("guarantee", RETURNED)
     return recording
 
 
 class Outcome(NamedTuple):
-    """What became of a state: whether `load` refused it, and which promises are broken."""
+    """Result of a state: whether `load` rejects it, and its broken guarantees."""
 
     refused: bool
     broken: list[str]
 
 
 def outcome(scenario: Scenario, state: State, folder: Path) -> Outcome:
-    """Read a state, and go on with it."""
+    """Read a state, and resume from it."""
     lay_out(state.tree, folder)
     out, broken, refused = folder / NAME, [], False
-    done, whole = {int(text) for text in state.promised - {WHOLE}}, WHOLE in state.promised
+    done, returned = {int(text) for text in state.guaranteed - {RETURNED}}, RETURNED in state.guaranteed
     try:
-        found = vijax.load(out)
+        dataset = vijax.load(out)
     except (ValueError, OSError) as error:
         refused = True
-        there = scenario.reads and (scenario.before or state.promised)
-        if "\n" in str(error) or whole or there:
+        must_load = scenario.reads and (scenario.before or state.guaranteed)
+        if "\n" in str(error) or returned or must_load:
             broken.append(f"load: {error}")
     else:
-        if not any(agrees(found, one, whole) for one in scenario.after[-1 if whole else 0 :]):
+        if not any(agrees(dataset, map_after, returned) for map_after in scenario.after[-1 if returned else 0 :]):
             broken.append("load: other numbers")
-        if _count(found) < sum(TILES[tile] for tile in done):
+        if _count(dataset) < sum(TILES[tile] for tile in done):
             broken.append("load: a tile that is done is not there")
     if scenario.study:
         broken += _resumed(scenario, out, done)
     return Outcome(refused, broken)
 
 
-def agrees(found: "xr.Dataset", whole: "xr.Dataset", complete: bool) -> bool:
-    """Return True if cells of a map that were run are as in another, and all were run if it is complete."""
-    ran = (found["status"] != Status.NOT_RUN).values
-    if set(found.variables) != set(whole.variables) or (complete and not ran.all()):
+def agrees(dataset: "xr.Dataset", reference: "xr.Dataset", complete: bool) -> bool:
+    """Return True if a map's computed cells equal another map, and all cells are computed if it must be complete."""
+    ran = (dataset["status"] != Status.NOT_RUN).values
+    if set(dataset.variables) != set(reference.variables) or (complete and not ran.all()):
         return False
-    numbers = all(np.array_equal(found[name].values[ran], whole[name].values[ran]) for name in whole)
-    return numbers and all(np.array_equal(found[name], whole[name]) for name in whole.coords)
+    numbers = all(np.array_equal(dataset[name].values[ran], reference[name].values[ran]) for name in reference)
+    return numbers and all(np.array_equal(dataset[name], reference[name]) for name in reference.coords)
 
 
-def _count(found: "xr.Dataset") -> int:
-    """Count the cells that were run."""
-    return int((found["status"] != Status.NOT_RUN).sum())
+def _count(dataset: "xr.Dataset") -> int:
+    """Count the computed cells."""
+    return int((dataset["status"] != Status.NOT_RUN).sum())
 
 
 def _resumed(scenario: Scenario, out: Path, done: set[int]) -> list[str]:
     ran: set[int] = set()
     try:
         with watched(ran.add):
-            found = scenario.call(out).load()
+            dataset = scenario.call(out).load()
     except (ValueError, OSError) as error:
         return [f"the same call: {error}"]
-    again = [f"tile {tile} is run again" for tile in sorted(ran & done)]
-    return again if agrees(found, scenario.after[-1], True) else [*again, "the same call: other numbers"]
+    repeated = [f"tile {tile} is run again" for tile in sorted(ran & done)]
+    return repeated if agrees(dataset, scenario.after[-1], True) else [*repeated, "the same call: other numbers"]
 
 
-def lose(scenario: Scenario, most: int | None, seed: int) -> list[Outcome]:
-    """Let power cuts interrupt a scenario in every way, or in so many."""
+def lose(scenario: Scenario, count: int | None, seed: int) -> list[Outcome]:
+    """Interrupt a scenario by power cuts in every way, or in a number of ways."""
     with tempfile.TemporaryDirectory() as folder:
         recording = record(scenario, Path(folder).resolve())
     outcomes = []
-    for state in states(recording, seed) if most is None else some_states(recording, most, seed):
+    for state in states(recording, seed) if count is None else random_states(recording, count, seed):
         with tempfile.TemporaryDirectory() as folder:
             outcomes.append(outcome(scenario, state, Path(folder).resolve()))
     return outcomes
 
 
 def main() -> int:
-    """Try all; exit with 0 if no promise is broken."""
+    """Run all scenarios; return 0 if no guarantee is broken."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--most", type=int, help="states of every scenario [all]")
     parser.add_argument("--seed", type=int, default=0, help="of what is drawn [0]")
-    given = parser.parse_args()
+    options = parser.parse_args()
     logging.disable(logging.WARNING)
     os.environ["VIJAX_TILE"] = str(TILES[0])
-    good = True
+    passed = True
     for exchanges in (True, False):
         print(f"where the disk {'can' if exchanges else 'cannot'} exchange two names:")
         if not exchanges:
-            store_folder.exchange = lambda one, other: False
+            store_folder.exchange = lambda first, second: False
         for name, scenario in scenarios().items():
-            outcomes = lose(scenario, given.most, given.seed)
-            broken = [one.broken for one in outcomes if one.broken]
-            refused = sum(one.refused for one in outcomes)
+            outcomes = lose(scenario, options.most, options.seed)
+            broken = [result.broken for result in outcomes if result.broken]
+            refused = sum(result.refused for result in outcomes)
             print(f"    {name}: {len(outcomes):,} states, {refused:,} refused, {len(broken):,} broken", flush=True)
             for reasons in broken[:5]:
                 print(f"        {'; '.join(reasons)}")
-            good &= not broken
-    return not good
+            passed &= not broken
+    return not passed
 
 
 if __name__ == "__main__":

@@ -1,11 +1,10 @@
-"""Do branches go on through grazes at soft walls, and is what they find beyond what is there?
+"""Do branches continue past grazings at soft walls, and are the orbits beyond correct?
 
     python benchmarks/soft_grazings.py              # 56 grazings
     python benchmarks/soft_grazings.py --grazings 5
-
-Attracting orbits of random soft pairs are followed along a random parameter, through the grazes that come. Beyond each
-graze the same orbit is looked for by itself, half way to the next bifurcation, from random guesses with its impacts,
-and followed without going through any graze: to the graze from the other side, and to the next bifurcation. One line a
+Attracting orbits of random soft pairs are continued along a random parameter, past all grazings. Beyond each grazing,
+halfway to the next bifurcation, the same orbit is searched independently from random guesses with its impacts. It is
+continued without passing a grazing: to the grazing from the other side, and to the next bifurcation. One line a
 figure. Typical printout:
 
     grazings with an orbit found beyond by itself                            56: 4 grazing contact (fewer), ...
@@ -26,25 +25,25 @@ from typing import NamedTuple
 import numpy as np
 
 import vijax
-from benchmarks.orbits import say
+from benchmarks.orbits import print_figure
+from vijax.continuation.branch_continuation import Branch
+from vijax.continuation.branch_events import Point
 from vijax.model.records import Status
 from vijax.orbits import orbit_properties, symmetry
-from vijax.orbits.continuation import Branch
-from vijax.orbits.events import Point
 from vijax.orbits.periodic import Orbit
 
 BOUNDS = {"d": (0.02, 0.3), "kappa": (3.0, 200.0), "r": (0.3, 0.9)}
-MOST_IMPACTS = 6  # of the orbit beyond a graze in full: random guesses find longer ones rarely
-GRAZINGS_EACH = 2  # that one orbit gives at most, each way
-BESIDE = 5  # orbits on either side whose residuals are told
-SAME = 1e-6  # an orbit found twice
-NEAR = 1e-3  # in which part of its range the parameter of another bifurcation of the kind would lie
+MOST_IMPACTS = 6  # of the full orbit beyond a grazing; random guesses rarely converge to longer ones
+GRAZINGS = 2  # most grazings of one orbit in each direction
+NEIGHBOURS = 5  # orbits on either side with printed residuals
+SAME = 1e-6  # difference up to which two results are one orbit
+NEAR = 1e-3  # fraction of the parameter's range; a farther bifurcation is another one
 BIFURCATIONS = ("fold", "flip", "pitchfork")
 PLAIN = vijax.ContinuationSettings(max_grazings=0)
 
 
-class Beyond(NamedTuple):
-    """A branch beyond a graze: the graze, the bifurcation after it, and an orbit between."""
+class PassedGrazing(NamedTuple):
+    """A branch past a grazing: the grazing, the next bifurcation, and an orbit between them."""
 
     graze: Point
     next: Point
@@ -53,16 +52,16 @@ class Beyond(NamedTuple):
 
 @dataclass
 class Figures:
-    """What was measured at every graze.
+    """Results at all grazings.
 
     Attributes:
-        residual: Largest of the orbits beside it, on both sides.
-        virtual: How many of these the impact map does not verify.
-        graze, next: How far off the graze and the next bifurcation are on the branch of the orbit found beyond.
-        pairs: The same of pitchforks that mirror pairs come to: two branches cross there, and Newton is singular.
-        kinds: What was passed.
-        unfound: Grazes beyond which random guesses did not find the orbit.
-        unmet: Grazes or bifurcations that its branch did not meet.
+        residual: Largest residual of the neighbouring orbits on both sides.
+        virtual: Number of these that the impact map does not verify.
+        graze, next: Differences of the grazing and of the next bifurcation on the independently computed branch.
+        pairs: The same for pitchforks of mirror pairs, where two branches cross and Newton's matrix is singular.
+        kinds: Kinds of the passed grazings.
+        unfound: Number of grazings without a result from random guesses.
+        unmet: Number of grazings or bifurcations that the independent branch does not reach.
     """
 
     residual: list[float] = field(default_factory=list)
@@ -76,31 +75,34 @@ class Figures:
 
 
 def main() -> int:
-    """Print what the command line asks for."""
+    """Print the figures that the command line selects."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--grazings", type=int, default=56)
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    draw, found = np.random.default_rng(given.seed), Figures()
-    while len(found.graze) < given.grazings:
+    options = parser.parse_args()
+    draw, figures = np.random.default_rng(options.seed), Figures()
+    while len(figures.graze) < options.grazings:
         along = str(draw.choice(["d", "kappa"]))
         for branch in branches(draw, along):
-            measure(branch, along, found)
-    names, counts = np.unique(found.kinds, return_counts=True)
+            measure(branch, along, figures)
+    names, counts = np.unique(figures.kinds, return_counts=True)
     passed = ", ".join(f"{count} {name}" for name, count in zip(names, counts, strict=True))
-    say("grazings with an orbit found beyond by itself", f"{len(found.graze)}: {passed}")
-    say("grazings beyond which random guesses found none", f"{found.unfound}")
-    say(f"largest residual of {BESIDE} orbits on either side", f"{max(found.residual):.1e}")
-    say("of these not verified by the impact map", f"{found.virtual}")
-    say("grazes and bifurcations that the branch of that orbit does not meet", f"{found.unmet}")
-    say("the graze, met from the other side: largest difference", f"{max(found.graze):.1e}")
-    for what, off in (("the next bifurcation", found.next), ("pitchfork of a mirror pair", found.pairs)):
-        say(f"{what}, found from there: number, largest difference", f"{len(off)}, {max(off, default=0.0):.1e}")
+    print_figure("grazings with an orbit found beyond by itself", f"{len(figures.graze)}: {passed}")
+    print_figure("grazings beyond which random guesses found none", f"{figures.unfound}")
+    print_figure(f"largest residual of {NEIGHBOURS} orbits on either side", f"{max(figures.residual):.1e}")
+    print_figure("of these not verified by the impact map", f"{figures.virtual}")
+    print_figure("grazes and bifurcations that the branch of that orbit does not meet", f"{figures.unmet}")
+    print_figure("the graze, met from the other side: largest difference", f"{max(figures.graze):.1e}")
+    for title, differences in (("the next bifurcation", figures.next), ("pitchfork of a mirror pair", figures.pairs)):
+        print_figure(
+            f"{title}, found from there: number, largest difference",
+            f"{len(differences)}, {max(differences, default=0.0):.1e}",
+        )
     return 0
 
 
 def branches(draw: np.random.Generator, along: str) -> list[Branch]:
-    """Follow an attracting orbit of a random pair both ways, through a few grazes."""
+    """Continue an attracting orbit of a random pair in both directions, past a few grazings."""
     d, r = (float(draw.uniform(*BOUNDS[name])) for name in ("d", "r"))
     kappa = float(np.exp(draw.uniform(*np.log(BOUNDS["kappa"]))))
     pair = vijax.impact_pair(d, kappa, r, float(draw.choice([0.0, 0.05])))
@@ -109,90 +111,94 @@ def branches(draw: np.random.Generator, along: str) -> list[Branch]:
     if int(orbit.status[0]) != Status.OK or int(orbit.count[0]) > MOST_IMPACTS:
         return []
     if int(orbit_properties.counts(orbit).period[0]) < period:
-        return []  # It is run through twice, and grazes twice at once.
-    if bool(symmetry.symmetric(orbit)[0]):
-        orbit = symmetry.halved(orbit)
-    settings = vijax.ContinuationSettings(max_grazings=GRAZINGS_EACH)
-    followed = (
-        vijax.follow_orbits(orbit, along, BOUNDS[along], direction=way, points=1500, settings=settings)
-        for way in ("down", "up")
+        return []  # a doubled orbit, with two grazings at once
+    if bool(symmetry.is_symmetric(orbit)[0]):
+        orbit = symmetry.close_half_way(orbit)
+    settings = vijax.ContinuationSettings(max_grazings=GRAZINGS)
+    both_directions = (
+        vijax.follow_orbits(orbit, along, BOUNDS[along], direction=direction, points=1500, settings=settings)
+        for direction in ("down", "up")
     )
-    return [branch for way in followed for branch in way]
+    return [branch for direction in both_directions for branch in direction]
 
 
-def measure(branch: Branch, along: str, found: Figures) -> None:
-    """Measure every graze of a branch after which it bifurcates before it grazes again."""
+def measure(branch: Branch, along: str, figures: Figures) -> None:
+    """Measure every grazing of a branch that a bifurcation follows before the next grazing."""
     unit = BOUNDS[along][1] - BOUNDS[along][0]
-    for beyond in places(branch):
-        other = again(beyond.orbit)
+    for passed in passed_grazings(branch):
+        other = search_again(passed.orbit)
         if other is None:
-            found.unfound += 1
+            figures.unfound += 1
             continue
-        met = [
+        points = [
             point
-            for one in vijax.follow_orbits(other, along, BOUNDS[along], points=1500, settings=PLAIN)
-            for point in one.points
+            for branch_of_other in vijax.follow_orbits(other, along, BOUNDS[along], points=1500, settings=PLAIN)
+            for point in branch_of_other.points
         ]
-        off = [distance(point, met) for point in (beyond.graze, beyond.next)]
-        if max(off) > NEAR * unit:
-            found.unmet += 1
+        differences = [distance(point, points) for point in (passed.graze, passed.next)]
+        if max(differences) > NEAR * unit:
+            figures.unmet += 1
             continue
-        beside = np.flatnonzero(np.diff(np.asarray(branch.orbit.count)))
-        at = beside[np.abs(branch.values[beside] - beyond.graze.value).argmin()]
-        rows = slice(max(at - BESIDE + 1, 0), at + BESIDE + 1)
-        found.residual.append(float(np.asarray(branch.orbit.residual)[rows].max()))
-        found.virtual += int((np.asarray(branch.orbit.status)[rows] != Status.OK).sum())
-        found.kinds.append(f"{beyond.graze.kind} ({'more' if beyond.graze.gained > 0 else 'fewer'})")
-        found.graze.append(off[0])
-        pair = beyond.next.kind == "pitchfork" and not bool(branch.orbit.sequence.mirrored[0])
-        (found.pairs if pair else found.next).append(off[1])
+        changes = np.flatnonzero(np.diff(np.asarray(branch.orbit.count)))
+        change = changes[np.abs(branch.values[changes] - passed.graze.value).argmin()]
+        rows = slice(max(change - NEIGHBOURS + 1, 0), change + NEIGHBOURS + 1)
+        figures.residual.append(float(np.asarray(branch.orbit.residual)[rows].max()))
+        figures.virtual += int((np.asarray(branch.orbit.status)[rows] != Status.OK).sum())
+        figures.kinds.append(f"{passed.graze.kind} ({'more' if passed.graze.impact_change > 0 else 'fewer'})")
+        figures.graze.append(differences[0])
+        pair = passed.next.kind == "pitchfork" and not bool(branch.orbit.sequence.mirrored[0])
+        (figures.pairs if pair else figures.next).append(differences[1])
 
 
-def places(branch: Branch) -> list[Beyond]:
-    """List the grazes of a branch that are followed by a bifurcation, with an orbit half way there."""
-    found = []
+def passed_grazings(branch: Branch) -> list[PassedGrazing]:
+    """Return the grazings of a branch that precede a bifurcation, with an orbit halfway."""
+    passed_list = []
     counts = np.asarray(branch.orbit.count)
     changes = np.flatnonzero(np.diff(counts))
-    passed = [index for index, point in enumerate(branch.points) if point.gained]
+    passed = [index for index, point in enumerate(branch.points) if point.impact_change]
     for change, index in zip(changes, passed, strict=False):
         if index + 1 == len(branch.points) or branch.points[index + 1].kind not in BIFURCATIONS:
             continue
         graze, following = branch.points[index], branch.points[index + 1]
-        place = nearest(branch, following)
+        last = nearest(branch, following)
         full = counts[change + 1] * (2 if bool(branch.orbit.sequence.mirrored[0]) else 1)
-        if place > change + 2 and full <= MOST_IMPACTS:
-            middle = (change + 1 + place) // 2
-            found.append(Beyond(graze, following, branch.orbit[middle : middle + 1]))
-    return found
+        if last > change + 2 and full <= MOST_IMPACTS:
+            middle = (change + 1 + last) // 2
+            passed_list.append(PassedGrazing(graze, following, branch.orbit[middle : middle + 1]))
+    return passed_list
 
 
 def nearest(branch: Branch, point: Point) -> int:
-    """Find the orbit of a branch that is nearest to a point."""
-    marks = np.column_stack([orbit_properties.marks(branch.orbit), branch.values])
-    return int(np.abs(marks - np.append(orbit_properties.marks(point.orbit)[0], point.value)).sum(axis=1).argmin())
+    """Return the index of the branch's orbit nearest to a point."""
+    features = np.column_stack([orbit_properties.orbit_signature(branch.orbit), branch.values])
+    return int(
+        np.abs(features - np.append(orbit_properties.orbit_signature(point.orbit)[0], point.value)).sum(axis=1).argmin()
+    )
 
 
-def again(orbit: Orbit) -> Orbit | None:
-    """Find an orbit by itself: from random guesses with its impacts in their order."""
-    full = symmetry.unfolded(orbit)
+def search_again(orbit: Orbit) -> Orbit | None:
+    """Search an orbit independently: from random guesses with its impacts in their order."""
+    full = symmetry.unfold(orbit)
     side = np.asarray(full.sequence.side)[0]
     walls = "".join("R" if wall > 0 else "L" for wall in side if wall)
     period = round(float(full.sequence.span[0]) / 2)
-    own = orbit.pair
-    pair = vijax.impact_pair(*(float(np.asarray(x)[0]) for x in (own.d, own.kappa, own.r, own.gamma)))
-    known = orbit_properties.marks(full)[0]
+    parameters = orbit.pair
+    pair = vijax.impact_pair(
+        *(float(np.asarray(x)[0]) for x in (parameters.d, parameters.kappa, parameters.r, parameters.gamma))
+    )
+    features = orbit_properties.orbit_signature(full)[0]
     for guesses in (1024, 8192):
         others = vijax.find_orbits(pair, walls, period, guesses=guesses)
         for index in range(len(others)):
-            if np.abs(orbit_properties.marks(others[index : index + 1])[0] - known).max() < SAME:
+            if np.abs(orbit_properties.orbit_signature(others[index : index + 1])[0] - features).max() < SAME:
                 other = others[index : index + 1]
-                return symmetry.halved(other) if bool(orbit.sequence.mirrored[0]) else other
+                return symmetry.close_half_way(other) if bool(orbit.sequence.mirrored[0]) else other
     return None
 
 
-def distance(point: Point, met: list[Point]) -> float:
-    """Find how far the nearest of the same kind is."""
-    return min((abs(point.value - other.value) for other in met if other.kind == point.kind), default=np.inf)
+def distance(point: Point, points: list[Point]) -> float:
+    """Return the distance of the nearest point of the same kind."""
+    return min((abs(point.value - other.value) for other in points if other.kind == point.kind), default=np.inf)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""Rows of benchmarks on disk, each with what made it: the machine, the versions and the commit.
+"""Rows of benchmarks on disk, each with its origin: the machine, the versions and the commit.
 
-Pages read them without what measured them, so nothing here imports a peer.
+Documentation pages read them without the benchmarks' dependencies, so this module imports no peer.
 """
 
 import csv
@@ -12,24 +12,26 @@ from typing import Any
 
 ROWS = Path(__file__).parent / "rows"
 MADE_BY = "made_by"
-"""The last column: what made a row."""
+"""Last column: origin of a row."""
 
 
-def write(path: Path, fields: Sequence[str], rows: Iterable[Sequence[Any]], kept: Iterable[Sequence[Any]] = ()) -> None:
-    """Write rows as they come, so that what was measured before a run is ended is there.
+def write(
+    path: Path, fields: Sequence[str], rows: Iterable[Sequence[Any]], earlier: Iterable[Sequence[Any]] = ()
+) -> None:
+    """Write rows as they arrive, so that an interrupted run leaves its finished rows.
 
     Args:
         path: The file.
-        fields: Names of the columns, without what made the rows.
-        rows: What this run measures.
-        kept: Rows that `read` gave of an earlier run; they stand first, with what made them then.
+        fields: Names of the columns, without the origin.
+        rows: Rows of this run.
+        earlier: Rows of an earlier run, as `read` returns them; they stand first, with their own origin.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     maker = made_by()
     with path.open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow([*fields, MADE_BY])
-        table.writerows(kept)
+        table.writerows(earlier)
         file.flush()
         for row in rows:
             table.writerow([*row, maker])
@@ -37,7 +39,7 @@ def write(path: Path, fields: Sequence[str], rows: Iterable[Sequence[Any]], kept
 
 
 def read(path: Path) -> list[Any]:
-    """Read rows as named tuples; a column in which all is numbers is one of floats. None where there is no file."""
+    """Read rows as named tuples; a column of numbers is converted to floats. The list is empty without a file."""
     if not path.exists():
         return []
     with path.open(newline="") as file:
@@ -48,17 +50,17 @@ def read(path: Path) -> list[Any]:
 
 
 def made_by() -> str:
-    """Say in one line what measures here."""
-    from vijax.planes.dataset import made_by as told
+    """Return the origin of rows measured here in one line."""
+    from vijax.maps.map_dataset import installation_attributes
 
-    made = told()
-    commit = made["commit"].removesuffix("-dirty")[:10] + ("-dirty" if made["commit"].endswith("-dirty") else "")
-    versions = f"JAX {made['version_jax']}, NumPy {made['version_numpy']}, Python {made['version_python']}"
-    return f"{made['source']} at {commit}, {versions}; {_processor()}, {os.cpu_count()} cores"
+    origin = installation_attributes()
+    commit = origin["commit"].removesuffix("-dirty")[:10] + ("-dirty" if origin["commit"].endswith("-dirty") else "")
+    versions = f"JAX {origin['version_jax']}, NumPy {origin['version_numpy']}, Python {origin['version_python']}"
+    return f"{origin['source']} at {commit}, {versions}; {_processor()}, {os.cpu_count()} cores"
 
 
 def _processor() -> str:
-    """Name the processor, as Linux does."""
+    """Return the name of the processor, on Linux."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

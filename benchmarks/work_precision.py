@@ -1,14 +1,14 @@
-"""Which method is the cheapest for the error that you can bear: soft walls, stiff walls, rigid walls, grazes, chaos?
+"""Which method is the cheapest for an acceptable error: soft walls, stiff walls, rigid walls, grazing, chaos?
 
     python benchmarks/work_precision.py           # all scenes: rows/work_precision.csv and the chart of the README
     python benchmarks/work_precision.py --quick   # one scene, few methods, timings that mean nothing: does it run?
 
-Regular scenes start on the attractor of each cell; the error is that of (u, v) after 8 periods, against 50-digit
-arithmetic, its median and worst over cells that lie close together. In chaos only averages mean anything: there the
-error is the mean deviation of P from that of a run 20 times as long, and is read in units of its standard error. The
-last scene asks for the derivative of the final state with respect to kappa, against differences in 50 digits. A cell
-without a number has an infinite error. The time is that of a warm call on many cells, in microseconds per cell-period;
-compilation stands beside it. Typical printout, two cores:
+Regular scenes start on the attractor of each cell; the error is the error of (u, v) after 8 periods, against 50-digit
+arithmetic, its median and maximum over near cells. In chaos only averages are meaningful: there the error is the
+mean deviation of P from a run 20 times as long, in units of its standard error. The last scene measures the derivative
+of the final state with respect to kappa, against differences in 50 digits. A cell without a number has an infinite
+error. The time is a warm call's time on many cells, in microseconds per cell-period; compilation is reported
+separately. Typical printout, two cores:
 
     2 cores, cpu, JAX 0.10.2
     soft, kappa = 4          exact               float64       0.285 us  error 1.5e-16
@@ -37,17 +37,17 @@ HERE = Path(__file__).parent
 CHART = HERE.parent / "scripts" / "gallery" / "work_precision.png"
 
 R = 0.5
-PERIODS = 8  # from the start to the state whose error is measured
-ROOM = 4 * PERIODS  # impacts
+PERIODS = 8  # from the start to the state with the measured error
+CAPACITY = 4 * PERIODS  # impacts
 SETTLING = 40  # times PERIODS, from the default start to the attractor
-COMPARED = 5  # cells of a scene whose error is measured
-NUDGE = mp.mpf("1e-18")  # relative, of kappa, for central differences in 50 digits: exact to 36
+COMPARED = 5  # cells of a scene with a measured error
+NUDGE = mp.mpf("1e-18")  # relative change of kappa for central differences in 50 digits: exact to 36 digits
 
-# Cells of a timing.
+# Number of cells for a timing.
 TIMED = {"exact": 16384, "ode": 2048, "rk4": 2048, "numba": 4096, "chain": 64, "scipy": COMPARED, "gradient": 64}
 LEAST_SECONDS, MOST_PERIODS = 0.2, 100  # of a timing
 
-CHAOTIC_CELLS, TRANSIENT, WINDOW, LONG = 1024, 50, 50, 20  # periods, and windows in the reference
+CHAOTIC_CELLS, TRANSIENT, WINDOW, LONG = 1024, 50, 50, 20  # numbers of periods; length of the reference in windows
 
 
 class Scene(NamedTuple):
@@ -60,7 +60,7 @@ class Scene(NamedTuple):
 
     @property
     def title(self) -> str:
-        """Give it as the chart says it."""
+        """Return the title in the chart."""
         return self.name + ("" if self.kappa is None else rf", $\kappa$ = {self.kappa:g}")
 
 
@@ -87,14 +87,14 @@ class Cells(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One method with one setting on one scene, as it goes to the CSV file and the chart."""
+    """One method with one setting on one scene, as stored in the CSV file and drawn in the chart."""
 
     scene: str
-    measure: str  # what the error is that of: state, power or gradient
+    measure: str  # quantity with the error: state, power or gradient
     method: str
     setting: str
     us: float  # microseconds per cell-period, warm
-    compile_s: float  # of the programs that this row was the first to need
+    compile_s: float  # of the programs that this row needs first
     error: float  # median
     worst: float
     lost: int  # cells without a number
@@ -102,7 +102,7 @@ class Row(NamedTuple):
 
 
 class Contender(NamedTuple):
-    """A method with a setting: how it is run for its answer, and how, and on how many cells, for its time."""
+    """A method with a setting: its result, and its run with a number of cells for the timing."""
 
     method: str
     setting: str
@@ -115,7 +115,7 @@ class Contender(NamedTuple):
 
 
 def pair_of(cells: Cells, dtype: str = "float64", kappa: Any = None) -> vijax.ImpactPair:
-    """Make the parameters of the cells, or those with another kappa."""
+    """Return the parameters of the cells, optionally with another kappa."""
     d, r, gamma = (jnp.broadcast_to(jnp.asarray(x, dtype), cells.d.shape) for x in (cells.d, R, cells.scene.gamma))
     if kappa is None and cells.scene.kappa is not None:
         kappa = jnp.full_like(d, cells.scene.kappa)
@@ -123,9 +123,11 @@ def pair_of(cells: Cells, dtype: str = "float64", kappa: Any = None) -> vijax.Im
 
 
 def follow(cells: Cells, dtype: str = "float64", **options: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Find the state after PERIODS by `vijax.trajectory`."""
-    room = None if options else ROOM  # a stepping engine's budget of steps grows with it, the exact engine's cost too
-    states = vijax.trajectory(pair_of(cells, dtype), cells.u0, cells.v0, PERIODS, max_impacts=room, **options).states
+    """Return the state after PERIODS by `vijax.trajectory`."""
+    max_impacts = None if options else CAPACITY  # step budget and cost grow with it
+    states = vijax.trajectory(
+        pair_of(cells, dtype), cells.u0, cells.v0, PERIODS, max_impacts=max_impacts, **options
+    ).states
     return np.asarray(states.u)[:, -1], np.asarray(states.v)[:, -1]
 
 
@@ -143,7 +145,7 @@ def slope(cells: Cells, **options: Any) -> tuple[np.ndarray, np.ndarray]:
 
     def end(kappa):
         pair = pair_of(cells, kappa=kappa)
-        states = vijax.trajectory(pair, cells.u0, cells.v0, PERIODS, max_impacts=ROOM, **options).states
+        states = vijax.trajectory(pair, cells.u0, cells.v0, PERIODS, max_impacts=CAPACITY, **options).states
         return states.u[:, -1], states.v[:, -1]
 
     kappa = pair_of(cells).kappa
@@ -168,7 +170,7 @@ def located(solve: Callable, cells: Cells, periods: int = PERIODS, **options: An
 
 
 def settled(scene: Scene) -> Cells:
-    """Find the cells whose errors are measured, each on its attractor at phase 0."""
+    """Return the cells with measured errors, each on its attractor at phase 0."""
     cells = Cells(scene, np.linspace(*scene.d, COMPARED), 0.02, 0.3)
     for _ in range(SETTLING):
         u, v = follow(cells)
@@ -179,18 +181,18 @@ def settled(scene: Scene) -> Cells:
 def truth(cells: Cells, by_kappa: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Compute the state after PERIODS in 50 digits, or its derivative by kappa.
 
-    The exact engine's impacts are only the guesses from which each event is found anew.
+    The exact engine's impacts are only the guesses for each event's root.
     """
-    run = vijax.trajectory(pair_of(cells), cells.u0, cells.v0, PERIODS, max_impacts=ROOM)
-    times, stays, filled = (np.asarray(x) for x in (run.impacts.t, run.impacts.duration, run.filled))
+    run = vijax.trajectory(pair_of(cells), cells.u0, cells.v0, PERIODS, max_impacts=CAPACITY)
+    times, durations, filled = (np.asarray(x) for x in (run.impacts.t, run.impacts.duration, run.filled))
     onsets = times + 2 * np.asarray(run.impacts.n)
     ends = []
     for cell, count in enumerate(filled):
-        onset, stay = onsets[cell, :count], stays[cell, :count]
-        if not (count and onset[-1] + stay[-1] < 2 * PERIODS):
+        onset, contact_durations = onsets[cell, :count], durations[cell, :count]
+        if not (count and onset[-1] + contact_durations[-1] < 2 * PERIODS):
             raise SystemExit(f"{cells.scene.name}: the last period must end in flight")
-        flights = np.diff(onset, prepend=0) - np.append(0, stay[:-1])
-        guesses = [(flight, s, 0.5 * s) for flight, s in zip(flights, stay, strict=True)]
+        flights = np.diff(onset, prepend=0) - np.append(0, contact_durations[:-1])
+        guesses = [(flight, s, 0.5 * s) for flight, s in zip(flights, contact_durations, strict=True)]
         parameters = [cells.d[cell], cells.scene.kappa, R, cells.scene.gamma, cells.u0[cell], cells.v0[cell]]
         with mp.workdps(yardstick.DIGITS):
             ends.append(_slope_50(parameters, guesses) if by_kappa else _state_50(parameters, guesses))
@@ -201,9 +203,9 @@ def truth(cells: Cells, by_kappa: bool = False) -> tuple[np.ndarray, np.ndarray]
 def _state_50(parameters: list[Any], guesses: list) -> tuple[mp.mpf, mp.mpf]:
     rows, _ = yardstick.mp_march(parameters, len(guesses), guesses)
     last, d, gamma = rows[-1], mp.mpf(parameters[0]), mp.mpf(parameters[3])
-    left = last.t + last.duration
-    rise, v = yardstick.mp_flight(gamma, left, last.v_out, 2 * PERIODS - left)
-    return last.side * d / 2 + rise, v
+    exit_time = last.t + last.duration
+    displacement, v = yardstick.mp_flight(gamma, exit_time, last.v_out, 2 * PERIODS - exit_time)
+    return last.side * d / 2 + displacement, v
 
 
 def _slope_50(parameters: list[Any], guesses: list) -> list[mp.mpf]:
@@ -216,68 +218,72 @@ def _slope_50(parameters: list[Any], guesses: list) -> list[mp.mpf]:
 
 
 def tolerances(*exponents: int) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield relative tolerances by their exponents, in words and as options; the absolute one is a hundredth."""
+    """Yield relative tolerances by their exponents, as text and as options; the absolute one is a hundredth."""
     for exponent in exponents:
         yield f"1e-{exponent}", {"rtol": 10.0**-exponent, "atol": 10.0 ** -(exponent + 2)}
 
 
 SOLVERS = {"Tsit5": (4, 6, 8, 10, 12), "Dopri8": (6, 8, 10, 12), "Kvaerno5": (4, 6, 8)}
 STEPS = (250, 1000, 4000)
-MORE_STEPS = (16000, 64000)  # for the cheapest only
+MORE_STEPS = (16000, 64000)  # for the cheapest method only
 
 
-def ours(scene: Scene) -> Iterator[Contender]:
-    """Yield vijax by all its methods."""
+def vijax_contenders(scene: Scene) -> Iterator[Contender]:
+    """Yield the methods of vijax."""
     for name, dtype in (("exact", "float64"), ("exact float32", "float32")):
         yield Contender(name, dtype, partial(follow, dtype=dtype), partial(sweep, dtype=dtype), TIMED["exact"])
     if scene.kappa is None:
         return
-    told: dict[str, Any]
+    options: dict[str, Any]
     for solver, exponents in SOLVERS.items():
         for setting, numbers in tolerances(*exponents):
-            told = {"method": "ode", "solver": solver} | numbers
-            yield Contender(f"ode {solver}", setting, partial(follow, **told), partial(sweep, **told), TIMED["ode"])
+            options = {"method": "ode", "solver": solver} | numbers
+            yield Contender(
+                f"ode {solver}", setting, partial(follow, **options), partial(sweep, **options), TIMED["ode"]
+            )
     for steps in STEPS:
-        told = {"method": "rk4", "steps": steps}
-        yield Contender("rk4", f"{steps}", partial(follow, **told), partial(sweep, **told), TIMED["rk4"])
+        options = {"method": "rk4", "steps": steps}
+        yield Contender("rk4", f"{steps}", partial(follow, **options), partial(sweep, **options), TIMED["rk4"])
 
 
-def theirs(scene: Scene) -> Iterator[Contender]:
+def peer_contenders(scene: Scene) -> Iterator[Contender]:
     """Yield the peers."""
     if scene.kappa is not None:
         for steps in (*STEPS, *MORE_STEPS):
             run = partial(rk4, steps=steps)
             yield Contender("numba RK4", f"{steps}", run, run, TIMED["numba"])
-    for setting, told in tolerances(4, 6, 8, 10, 12):
-        run = partial(located, peers.dormand_prince, rtol=told["rtol"])
+    for setting, options in tolerances(4, 6, 8, 10, 12):
+        run = partial(located, peers.dormand_prince, rtol=options["rtol"])
         yield Contender("numba DP5 + events", setting, run, run, TIMED["numba"])
-    for setting, told in tolerances(6, 8, 10):
-        run = partial(located, peers.diffrax_chain, rtol=told["rtol"])
+    for setting, options in tolerances(6, 8, 10):
+        run = partial(located, peers.diffrax_chain, rtol=options["rtol"])
         yield Contender("diffrax restarts", setting, run, run, TIMED["chain"])
     for solver, exponents in (("DOP853", (6, 9, 12)), ("Radau", (5, 8))):
-        for setting, told in tolerances(*exponents):
-            run = partial(located, peers.scipy_events, rtol=told["rtol"], solver=solver)
+        for setting, options in tolerances(*exponents):
+            run = partial(located, peers.scipy_events, rtol=options["rtol"], solver=solver)
             yield Contender(f"SciPy {solver}", setting, run, run, TIMED["scipy"])
 
 
 def of_gradients() -> Iterator[Contender]:
-    """Yield what can be differentiated."""
+    """Yield the differentiable methods."""
     choices: list[tuple[str, str, dict[str, Any]]] = [("exact", "float64", {})]
     for solver in ("Tsit5", "Dopri8"):
-        named: dict[str, Any] = {"method": "ode", "solver": solver}
-        choices += [(f"ode {solver}", setting, named | more) for setting, more in tolerances(4, 6, 8, 10)]
+        base_options: dict[str, Any] = {"method": "ode", "solver": solver}
+        choices += [
+            (f"ode {solver}", setting, base_options | tolerance) for setting, tolerance in tolerances(4, 6, 8, 10)
+        ]
     choices += [("rk4", f"{steps}", {"method": "rk4", "steps": steps}) for steps in STEPS]
-    for name, setting, told in choices:
-        run = partial(slope, **told)
+    for name, setting, options in choices:
+        run = partial(slope, **options)
         yield Contender(name, setting, run, partial(as_it_is, run), TIMED["gradient"])
 
 
 def of_averages() -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Yield what can go on for long enough: names, settings, options of a sweep."""
+    """Yield the methods that can run for long enough: names, settings, options of a sweep."""
     for name, dtype in (("exact", "float64"), ("exact float32", "float32")):
         yield name, dtype, {"dtype": dtype}
-    for setting, told in tolerances(4, 6, 8):
-        yield "ode Tsit5", setting, {"method": "ode", "solver": "Tsit5"} | told
+    for setting, options in tolerances(4, 6, 8):
+        yield "ode Tsit5", setting, {"method": "ode", "solver": "Tsit5"} | options
     for steps in (100, *STEPS[:2]):
         yield "rk4", f"{steps}", {"method": "rk4", "steps": steps}
 
@@ -286,19 +292,19 @@ def of_averages() -> Iterator[tuple[str, str, dict[str, Any]]]:
 
 
 def seconds(call: Callable[[], Any]) -> float:
-    """Time a call whose result lies in host memory."""
-    begun = time.perf_counter()
+    """Time a call with its result in host memory."""
+    start = time.perf_counter()
     call()
-    return time.perf_counter() - begun
+    return time.perf_counter() - start
 
 
-def pace(run: Callable[[int], Any], cells: int, periods: int | None = None) -> tuple[float, float]:
-    """Time a warm call in microseconds per cell-period, and what its first call took beyond a second one.
+def timing(run: Callable[[int], Any], cells: int, periods: int | None = None) -> tuple[float, float]:
+    """Return a warm call's time in microseconds per cell-period, and the additional seconds of its first call.
 
     Args:
         run: A call for a number of periods; it compiles one program for all of them.
-        cells: How many it runs.
-        periods: The number, if it has no choice; otherwise as many as make the call long enough to time.
+        cells: Number of its cells.
+        periods: The number of periods, if it is fixed; by default enough periods for a reliable timing.
     """
     count = periods or 1
     cold, warm = seconds(partial(run, count)), seconds(partial(run, count))
@@ -310,80 +316,91 @@ def pace(run: Callable[[int], Any], cells: int, periods: int | None = None) -> t
 
 
 def as_it_is(answer: Callable[[Cells], Any], cells: Cells, _: int) -> Any:
-    """Run for PERIODS, which cannot be had for another number of periods without compiling it again."""
+    """Run for PERIODS; another number of periods would need another compilation."""
     return answer(cells)
 
 
-def deviation(found: tuple[np.ndarray, np.ndarray], true: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Measure the distance of each cell's answer from the true one, infinite where there is none."""
-    error = np.hypot(*(np.asarray(a, float) - b for a, b in zip(found, true, strict=True)))
+def deviation(computed: tuple[np.ndarray, np.ndarray], exact: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Return the distance of each cell's result from the exact one, infinite without a result."""
+    error = np.hypot(*(np.asarray(a, float) - b for a, b in zip(computed, exact, strict=True)))
     return np.where(np.isfinite(error), error, np.inf)
 
 
 def regular(scene: Scene, contenders: Iterator[Contender], quick: bool) -> Iterator[Row]:
-    """Measure error of the final state, cost and compile time of every contender on one scene."""
+    """Measure the final state's error, cost and compile time of every contender on one scene."""
     cells = settled(scene)
-    true = truth(cells)
+    exact = truth(cells)
     middle = COMPARED // 2
-    for one in contenders:
+    for contender in contenders:
         if quick:
-            us, compiling = pace(partial(as_it_is, one.answer, cells), COMPARED, PERIODS)
+            us, compiling = timing(partial(as_it_is, contender.answer, cells), COMPARED, PERIODS)
         else:
-            many = Cells(scene, np.linspace(*scene.d, one.cells), cells.u0[middle], cells.v0[middle])
-            us, compiling = pace(partial(one.timed, many), one.cells)
-        error = deviation(one.answer(cells), true)
-        yield Row(scene.title, "state", one.method, one.setting, us, compiling, *summary(error))
+            many = Cells(scene, np.linspace(*scene.d, contender.cells), cells.u0[middle], cells.v0[middle])
+            us, compiling = timing(partial(contender.timed, many), contender.cells)
+        error = deviation(contender.answer(cells), exact)
+        yield Row(scene.title, "state", contender.method, contender.setting, us, compiling, *summary(error))
 
 
 def summary(error: np.ndarray) -> tuple[float, float, int]:
-    """Find median, worst and number of infinite errors."""
+    """Return median, maximum and number of infinite errors."""
     return float(np.median(error)), float(error.max()), int(np.isinf(error).sum())
 
 
 def gradients(scene: Scene) -> Iterator[Row]:
     """Measure the relative error of the derivative of the final state with respect to kappa."""
     cells = settled(scene)
-    true = truth(cells, by_kappa=True)
+    exact = truth(cells, by_kappa=True)
     copies = np.resize(np.arange(COMPARED), TIMED["gradient"])
     many = Cells(scene, *(np.asarray(x)[copies] for x in cells[1:]))
-    for one in of_gradients():
-        us, compiling = pace(partial(one.timed, many), one.cells, PERIODS)
-        u, v = one.answer(many)
-        error = deviation((u[:COMPARED], v[:COMPARED]), true) / np.hypot(*true)
+    for contender in of_gradients():
+        us, compiling = timing(partial(contender.timed, many), contender.cells, PERIODS)
+        u, v = contender.answer(many)
+        error = deviation((u[:COMPARED], v[:COMPARED]), exact) / np.hypot(*exact)
         name = scene.title.replace(scene.name, "gradient")
-        yield Row(name, "gradient", one.method, one.setting, us, compiling, *summary(error))
+        yield Row(name, "gradient", contender.method, contender.setting, us, compiling, *summary(error))
 
 
 def averages(scene: Scene) -> Iterator[Row]:
     """Measure the mean relative deviation of P over chaotic cells, and its standard error."""
     cells = Cells(scene, np.linspace(*scene.d, CHAOTIC_CELLS), None, None)
 
-    def power(periods: int, transient: int, **told: Any) -> np.ndarray:
-        return sweep(cells, periods, transient=transient, outputs=("P",), **told).P.values.ravel().astype(float)
+    def power(periods: int, transient: int, **options: Any) -> np.ndarray:
+        return sweep(cells, periods, transient=transient, outputs=("P",), **options).P.values.ravel().astype(float)
 
-    true = power(LONG * WINDOW, TRANSIENT)
-    for name, setting, told in of_averages():
-        compiling = seconds(partial(power, 1, 0, **told))
-        begun = time.perf_counter()
-        off = power(WINDOW, TRANSIENT, **told) / true - 1
-        us = 1e6 * (time.perf_counter() - begun) / (CHAOTIC_CELLS * (TRANSIENT + WINDOW))
-        lost = int((~np.isfinite(off)).sum())
-        error = float("inf") if lost else abs(float(off.mean()))
-        noise = float(np.std(off[np.isfinite(off)])) / CHAOTIC_CELLS**0.5
-        yield Row(scene.title, "power", name, setting, us, compiling, error, float(np.abs(off).max()), lost, noise)
+    reference = power(LONG * WINDOW, TRANSIENT)
+    for name, setting, options in of_averages():
+        compiling = seconds(partial(power, 1, 0, **options))
+        start = time.perf_counter()
+        relative_deviation = power(WINDOW, TRANSIENT, **options) / reference - 1
+        us = 1e6 * (time.perf_counter() - start) / (CHAOTIC_CELLS * (TRANSIENT + WINDOW))
+        lost = int((~np.isfinite(relative_deviation)).sum())
+        error = float("inf") if lost else abs(float(relative_deviation.mean()))
+        noise = float(np.std(relative_deviation[np.isfinite(relative_deviation)])) / CHAOTIC_CELLS**0.5
+        yield Row(
+            scene.title,
+            "power",
+            name,
+            setting,
+            us,
+            compiling,
+            error,
+            float(np.abs(relative_deviation).max()),
+            lost,
+            noise,
+        )
 
 
 def quick_contenders() -> Iterator[Contender]:
-    """Yield few, that compile in seconds."""
-    wanted = {
+    """Yield a few contenders that compile in seconds."""
+    settings = {
         "exact": {"float64"},
         "ode Tsit5": {"1e-4", "1e-6", "1e-8"},
         "numba RK4": {"250", "4000"},
         "numba DP5 + events": {"1e-4", "1e-6", "1e-8"},
         "SciPy DOP853": {"1e-6", "1e-9"},
     }
-    everyone = (*ours(MID), *theirs(MID))
-    return (one for one in everyone if one.setting in wanted.get(one.method, ()))
+    all_contenders = (*vijax_contenders(MID), *peer_contenders(MID))
+    return (contender for contender in all_contenders if contender.setting in settings.get(contender.method, ()))
 
 
 def measure(quick: bool) -> Iterator[Row]:
@@ -392,13 +409,13 @@ def measure(quick: bool) -> Iterator[Row]:
         yield from regular(MID, quick_contenders(), quick)
         return
     for scene in SCENES:
-        yield from regular(scene, iter((*ours(scene), *theirs(scene))), quick)
+        yield from regular(scene, iter((*vijax_contenders(scene), *peer_contenders(scene))), quick)
     yield from averages(CHAOS)
     yield from gradients(MID)
 
 
-def tell(row: Row) -> str:
-    """Put a row in words."""
+def row_text(row: Row) -> str:
+    """Return the text of a row."""
     name = row.scene.replace("$", "").replace("\\", "")
     noise = f" +- {row.noise:.1e}" if row.noise else ""
     lost = f"  {row.lost} CELLS LOST" if row.lost else ""
@@ -406,26 +423,26 @@ def tell(row: Row) -> str:
 
 
 def main() -> None:
-    """Measure, print, save the rows, draw the chart."""
+    """Measure, print and store the rows, and draw the chart."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="one scene, few methods, seconds in all: does it run?")
     parser.add_argument("--rows", type=Path, default=tables.ROWS, help="folder for the raw rows")
     parser.add_argument("--chart", type=Path, help="picture to draw; that of the README unless --quick")
     parser.add_argument("--redraw", action="store_true", help="draw the stored rows again, measure nothing")
-    given = parser.parse_args()
-    chart = given.chart or (None if given.quick else CHART)
-    path = given.rows / f"work_precision{'_quick' if given.quick else ''}.csv"
-    if not given.redraw:
+    options = parser.parse_args()
+    chart = options.chart or (None if options.quick else CHART)
+    path = options.rows / f"work_precision{'_quick' if options.quick else ''}.csv"
+    if not options.redraw:
         print(f"{os.cpu_count()} cores, {jax.devices()[0].device_kind}, JAX {jax.__version__}")
-        tables.write(path, Row._fields, told(measure(given.quick)))
+        tables.write(path, Row._fields, print_rows(measure(options.quick)))
     if chart is not None:
         work_precision(tables.read(path), chart)
 
 
-def told(rows: Iterator[Row]) -> Iterator[Row]:
-    """Print rows as they come."""
+def print_rows(rows: Iterator[Row]) -> Iterator[Row]:
+    """Print rows as they are measured."""
     for row in rows:
-        print(tell(row), flush=True)
+        print(row_text(row), flush=True)
         yield row
 
 

@@ -1,1 +1,1 @@
-"""The pages of vijax: what builds them, what they show of the program itself, and what their code printed."""
+"""The pages of vijax: their build, the parts generated from the program, and the outputs of their code."""

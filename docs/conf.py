@@ -1,4 +1,4 @@
-"""Settings of Sphinx. Whatever a page loads is served from the built folder: theme, search, formulas and pictures."""
+"""Settings of Sphinx. All files that a page loads are in the built folder: theme, search, formulas and pictures."""
 
 from importlib import import_module
 from pathlib import Path
@@ -15,17 +15,17 @@ author = copyright = "the authors of vijax"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
 exclude_patterns = ["build", "outputs", "generated"]
 
-# Every page is read by `executed.read`, which gives its code cells the outputs that are kept of them.
+# `executed.read` reads each page and adds the stored outputs to its code cells.
 nb_custom_formats = {".md": ["docs.executed.read", {}, False]}
 nb_execution_mode = "off"
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
 myst_heading_anchors = 3
 
-autodoc_typehints = "none"  # docstrings tell shapes, units and ranges; the annotations of arrays would drown them
+autodoc_typehints = "none"  # docstrings state shapes, units and ranges; annotations of arrays are too long
 autodoc_member_order = "bysource"
-napoleon_custom_sections = [("Attributes", "params_style")]  # a record is made of its fields
-highlight_language = "none"  # of indented blocks, which are lines of a shell
-default_role = "code"  # what docstrings put into single backticks
+napoleon_custom_sections = [("Attributes", "params_style")]  # a record is constructed from its fields
+highlight_language = "none"  # indented blocks are command lines of a shell
+default_role = "code"  # single backticks in docstrings
 smartquotes = False  # an option begins with two hyphens
 
 html_theme = "furo"
@@ -41,6 +41,6 @@ html_show_sourcelink = False
 
 
 def setup(app: Sphinx) -> None:
-    """Write what pages show of the program itself before they are read."""
+    """Write the generated parts of pages before Sphinx reads the pages."""
     app.connect("builder-inited", lambda _: generated.write())
     docstrings.setup(app)

@@ -1,7 +1,7 @@
-"""Outputs of the pages' code: executed by one command, kept in the repository by digest, shown by the build.
+"""Outputs of the pages' code: executed by one command, stored in the repository by digest, shown by the build.
 
-The cells of a page run in one kernel, in an empty folder. What they printed is kept in `outputs/PAGE-DIGEST.ipynb`. The
-digest is that of their code, so a page whose code has changed has no outputs until it is executed anew.
+The cells of a page run in one kernel, in an empty folder. Their outputs are stored in `outputs/PAGE-DIGEST.ipynb`. The
+digest is computed from their code, so a page with changed code has no outputs until it is executed again.
 """
 
 import hashlib
@@ -19,12 +19,12 @@ from nbformat import NotebookNode
 HERE = Path(__file__).parent
 OUTPUTS = HERE / "outputs"
 RELATIVE = 1e-3
-"""How far a printed number may move before it counts as another result. Averages over chaos move by their standard
-errors where another machine rounds otherwise, and those are below this on the pages."""
-SHOWN = ("text/plain", "image/png")
-"""Kinds of outputs that are kept. Datasets and tables have a plain form too, which can be read in a diff."""
+"""Largest relative change of a printed number that does not count as another result. Averages over chaos change by
+their standard errors if another machine rounds differently; on the pages these errors are smaller."""
+STORED_KINDS = ("text/plain", "image/png")
+"""Kinds of outputs that are stored. Datasets and tables also have a plain form, which is readable in a diff."""
 
-# Pictures are as small as they are legible. A warning is shown without the path of the machine that ran the page.
+# Pictures are as small as possible while legible. A warning is shown without the path of the machine that ran the page.
 _SETUP = """
 import warnings
 get_ipython().run_line_magic("matplotlib", "inline")
@@ -32,23 +32,23 @@ get_ipython().run_line_magic("config", "InlineBackend.rc = {'figure.dpi': 80}")
 warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\\n"
 """
 _CELL_SECONDS = 300  # a cell that takes longer hangs
-# They take half a minute and more with nothing kept. What several pages need, the first of them compiles for all.
+# Without stored programs, each takes at least half a minute. The first page compiles the programs that several need.
 _LONGEST = ("curves.md", "design.md", "failures.md", "derivatives.md", "stiffness.md", "power-drop.md")
 _NUMBER = re.compile(r"[-+]?(?:\d[\d,]*\.?\d*|\.\d+)(?:e[-+]?\d+)?")
-# Durations and rates depend on the hour, and so do spaces that align them.
+# Durations and rates differ between runs, and so do the spaces that align them.
 _TIMES = re.compile(r"[\d.,]+ ?(?:s|ms|us|min)\b|[\d.,]+k? ?\w+/s\b|\s+")
 
 
 def pages() -> Iterator[Path]:
-    """List the pages that have cells."""
+    """Yield the pages that have cells."""
     for path in sorted(HERE.rglob("*.md")):
         if not {"build", "generated"} & set(path.relative_to(HERE).parts) and _cells(read_page(path)):
             yield path
 
 
 def changed() -> Iterator[Path]:
-    """List the pages whose code has changed since they were executed."""
-    return (path for path in pages() if kept(read_page(path)) is None)
+    """Yield the pages with code that has changed since its execution."""
+    return (path for path in pages() if stored_outputs(read_page(path)) is None)
 
 
 def read_page(path: Path) -> NotebookNode:
@@ -57,7 +57,7 @@ def read_page(path: Path) -> NotebookNode:
 
 
 def read(text: str) -> NotebookNode:
-    """Read a page as a notebook with the outputs that are kept of it, for MyST-NB.
+    """Read a page as a notebook with its stored outputs, for MyST-NB.
 
     Raises:
         ValueError: A page has cells and no outputs.
@@ -65,40 +65,40 @@ def read(text: str) -> NotebookNode:
     notebook = read_myst_markdown_notebook(text, add_source_map=True)
     notebook.metadata["language_info"] = {"name": "python", "pygments_lexer": "ipython3"}
     if _cells(notebook):
-        if (path := kept(notebook)) is None:
+        if (path := stored_outputs(notebook)) is None:
             raise ValueError("the code of this page has changed since it was executed; run python docs --execute")
         for cell, old in zip(_cells(notebook), _cells(nbformat.read(path, as_version=4)), strict=True):
             cell.outputs = old.outputs
     return notebook
 
 
-def kept(notebook: NotebookNode) -> Path | None:
-    """Find the file with the outputs of a page, unless its code has changed since."""
+def stored_outputs(notebook: NotebookNode) -> Path | None:
+    """Return the file with the outputs of a page; None if its code has changed since."""
     return next(OUTPUTS.glob(f"*-{_digest(notebook)}.ipynb"), None)
 
 
 def longest_first(paths: Iterable[Path]) -> list[Path]:
-    """Sort pages so that none of those that take long begins when the others are done."""
+    """Sort pages so that the long ones start first."""
     long = dict(zip(_LONGEST, range(len(_LONGEST)), strict=True))
     return sorted(paths, key=lambda path: long.get(path.name, len(long)))
 
 
 def stray() -> list[Path]:
-    """List the files of outputs that belong to no page as it is now."""
-    return sorted(set(OUTPUTS.glob("*.ipynb")) - {kept(read_page(path)) for path in pages()})
+    """Return the files of outputs that belong to no current page."""
+    return sorted(set(OUTPUTS.glob("*.ipynb")) - {stored_outputs(read_page(path)) for path in pages()})
 
 
 async def execute(path: Path) -> list[str]:
-    """Execute the cells of a page, keep their outputs and say what differs from those that were kept.
+    """Execute the cells of a page, store their outputs, and return the differences from the outputs stored before.
 
-    Pictures are kept anew, but not compared: pixels differ between versions of fonts.
+    Pictures are stored again, but not compared: pixels differ between versions of fonts.
 
     Raises:
-        CellControlSignal: A cell raised, or took too long; the outputs that were kept are kept.
+        CellControlSignal: A cell raised, or took too long; the stored outputs do not change.
         DeadKernelError: The kernel ended.
     """
     fresh = read_page(path)
-    before = kept(fresh)
+    before = stored_outputs(fresh)
     fresh.cells.insert(0, nbformat.v4.new_code_cell(_SETUP))
     with tempfile.TemporaryDirectory() as folder:
         place = {"metadata": {"path": folder}}
@@ -117,7 +117,7 @@ async def execute(path: Path) -> list[str]:
 
 
 def differ(old: str, new: str) -> bool:
-    """Say whether two printed texts differ in their words, or in a number by more than `RELATIVE`."""
+    """Return True if two printed texts differ in their words, or in a number by more than `RELATIVE`."""
     old, new = _TIMES.sub(" ", old), _TIMES.sub(" ", new)
     if _NUMBER.sub("0", old) != _NUMBER.sub("0", new):
         return True
@@ -144,7 +144,7 @@ def _keep(notebook: NotebookNode, page: Path) -> None:
         old.unlink()
     notebook.cells = _cells(notebook)
     for number, cell in enumerate(notebook.cells):
-        # What changes with every execution would be noise in a diff.
+        # Values that change with each execution would be noise in a diff.
         cell.update(id=str(number), execution_count=None, metadata={})
     notebook.metadata = nbformat.from_dict({})
     OUTPUTS.mkdir(exist_ok=True)
@@ -152,7 +152,7 @@ def _keep(notebook: NotebookNode, page: Path) -> None:
 
 
 def _joined(outputs: list[NotebookNode]) -> Iterator[NotebookNode]:
-    """Join what one stream was given in pieces, as their number depends on the hour."""
+    """Join the pieces of each stream, as the number of pieces differs between runs."""
     streams: dict[str, NotebookNode] = {}
     for output in outputs:
         if output.output_type != "stream":
@@ -166,9 +166,9 @@ def _joined(outputs: list[NotebookNode]) -> Iterator[NotebookNode]:
 
 def _plain(output: NotebookNode) -> NotebookNode:
     if "data" in output:
-        output.data = nbformat.from_dict({kind: output.data[kind] for kind in SHOWN if kind in output.data})
+        output.data = nbformat.from_dict({kind: output.data[kind] for kind in STORED_KINDS if kind in output.data})
         if "image/png" in output.data:
-            output.data.pop("text/plain", None)  # it says no more than that there is a figure
+            output.data.pop("text/plain", None)  # it only states that there is a figure
         output.metadata = nbformat.from_dict({})
     if "execution_count" in output:
         output.execution_count = None
@@ -179,11 +179,11 @@ def _differences(old: NotebookNode, new: NotebookNode) -> Iterator[str]:
     before, now = _texts(old), _texts(new)
     if len(before) != len(now):
         yield f"{len(before)} outputs were kept, {len(now)} came:\n{new.source}"
-    for one, other in zip(before, now, strict=False):
-        if differ(one, other):
-            yield f"kept:\n{one}\ncame:\n{other}"
+    for old_text, new_text in zip(before, now, strict=False):
+        if differ(old_text, new_text):
+            yield f"kept:\n{old_text}\ncame:\n{new_text}"
 
 
 def _texts(cell: NotebookNode) -> list[str]:
-    """Give what each output says; of a picture, that there is one."""
+    """Return the text of each output; for a picture, a placeholder."""
     return [output.get("text") or output.get("data", {}).get("text/plain", "a picture") for output in cell.outputs]

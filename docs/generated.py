@@ -1,4 +1,4 @@
-"""Pieces of pages that the program writes, from the tables that it reads and the rows that benchmarks keep."""
+"""Parts of pages that are generated from the tables of the program and the stored rows of benchmarks."""
 
 from pathlib import Path
 
@@ -8,16 +8,16 @@ from docs import measured
 from docs.markdown import escaped, table
 from vijax.cli.main import vijax as command
 from vijax.cli.page import Page
+from vijax.maps import outputs
+from vijax.maps.outputs import ON_REQUEST
 from vijax.model.quantities import AXES, QUANTITIES
 from vijax.model.records import Status
-from vijax.planes import outputs
-from vijax.planes.outputs import ON_REQUEST
 
 INTO = Path(__file__).parent / "generated"
 
 
 def write() -> None:
-    """Write the pages into `generated`; a page that says the same as before is left, so that it is not built again."""
+    """Write the parts into `generated`; an unchanged file is not written, so that Sphinx does not rebuild its page."""
     INTO.mkdir(exist_ok=True)
     texts = {"command": _command(), "status": _status(), "quantities": _quantities()}
     texts |= {"outputs": _outputs(1), "outputs_expected": _outputs(2)}
@@ -50,13 +50,13 @@ def _page(name: str, above: click.Context) -> str:
 def _outputs(starts: int) -> str:
     rows = [
         (f"`{name}`", output.units, escaped(output.description) + (" (on request)" if name in ON_REQUEST else ""))
-        for name, output in outputs.table(starts).items()
+        for name, output in outputs.available_outputs(starts).items()
     ]
     return table(("variable", "unit", "what it is"), rows)
 
 
 def _status() -> str:
-    rows = [(str(int(one)), f"`{one.name.lower()}`", escaped(one.advice)) for one in Status]
+    rows = [(str(int(status)), f"`{status.name.lower()}`", escaped(status.advice)) for status in Status]
     return table(("value", "name", "what to do"), rows)
 
 

@@ -1,4 +1,4 @@
-"""What generated pieces of pages are written with."""
+"""Markdown of generated parts of pages."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -10,6 +10,6 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |" for line in lines) + "\n"
 
 
-def escaped(said: str) -> str:
-    """Escape what Markdown would read as markup in a text of help."""
-    return re.sub(r"([*_<>$\[\]])", r"\\\1", said)
+def escaped(text: str) -> str:
+    """Escape characters of a help text that Markdown would read as markup."""
+    return re.sub(r"([*_<>$\[\]])", r"\\\1", text)

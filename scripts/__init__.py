@@ -1,1 +1,1 @@
-"""Doors to the command `vijax`, one file each, and `paper`, which draws the paper's figures and checks its claims."""
+"""Scripts: one file for each subcommand of `vijax`; `paper` draws the figures of the paper and checks its claims."""

@@ -1,15 +1,15 @@
-"""Which attractor each start ends on: `vijax basins`.
+"""The attractor that each start reaches: `vijax basins`.
 
 python scripts/basins.py
-python scripts/basins.py --help  # options, and more lines to begin with
+python scripts/basins.py --help  # options and examples
 """
 
-from vijax.cli.basins import basins
+from vijax.cli.commands.basins import basins
 from vijax.cli.process import command, run
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command and give its exit code; see `process.run`."""
+    """Run the command and return its exit code; see `process.run`."""
     return run(basins, arguments)
 
 

@@ -1,4 +1,4 @@
-"""Print the name of the file of tested versions that fits this Python: `python3 -m scripts.constraints`."""
+"""Print the name of the constraints file for this version of Python: `python3 -m scripts.constraints`."""
 
 import re
 import sys
@@ -8,16 +8,17 @@ _ROOT = Path(__file__).parent.parent
 
 
 def file_for(version: tuple[int, ...]) -> str:
-    """Return the name of the file for a version of Python.
+    """Return the name of the constraints file for a version of Python.
 
-    The newest JAX has no release for Python 3.11, so that one file does not serve all.
+    The newest JAX has no release for Python 3.11, so one file cannot serve all versions.
     """
     return "constraints-3.13.txt" if version >= (3, 13) else "constraints.txt"
 
 
 def pinned(file: str) -> dict[str, str]:
-    """Return the version of each distribution that a file names, by its normalized name."""
+    """Return the pinned version of each distribution in a file, by normalised name."""
     pins = re.findall(r"^([\w.-]+)==(.+)$", (_ROOT / file).read_text(encoding="utf-8"), re.M)
+    # Normalisation of PEP 503: runs of - _ . become one -.
     return {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in pins}
 
 

@@ -1,15 +1,15 @@
 """A map of harvested energy: `vijax sweep`, and `vijax compare` with --compare rigid.
 
 python scripts/grid.py
-python scripts/grid.py --help  # options, and more lines to begin with
+python scripts/grid.py --help  # options and examples
 """
 
-from vijax.cli.grid import grid
+from vijax.cli.commands.grid import grid
 from vijax.cli.process import command, run
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command and give its exit code; see `process.run`."""
+    """Run the command and return its exit code; see `process.run`."""
     return run(grid, arguments)
 
 

@@ -1,4 +1,4 @@
-"""Change one line of the package at a time, run the tests that depend on it, and print what no test notices.
+"""Change one line of the package at a time, run the tests that depend on it, and print the undetected changes.
 
     python scripts/mutants.py                                   # 200 changes, seed 0, on two workers
     python scripts/mutants.py --count 20 --only vijax/orbits    # of one folder or file
@@ -6,8 +6,8 @@
 
 A change, or mutant, flips a sign, alters a constant, moves the border of a comparison or swaps two arguments. Each is
 made in a copy of the repository; the test files that depend on the module run there, nearest and cheapest first
-(`scripts/tests_for.py`), until one fails. A mutant that survives points at code that no test holds, or at code whose
-change has no effect; `tests/mutants.toml` lists the second kind with the reason.
+(`scripts/tests_for.py`), until one fails. A mutant that survives indicates code without a test, or a change without
+effect; `tests/mutants.toml` lists the second kind with the reason.
 """
 
 import argparse
@@ -28,8 +28,9 @@ from typing import NamedTuple
 
 from scripts.tests_for import ROOT, dependent_files
 
-FOLDERS = tuple(f"vijax/{name}" for name in ("model", "engine", "batch", "orbits", "design", "planes"))
-KNOWN = ROOT / "tests/mutants.toml"
+_LAYERS = ("model", "impact", "simulation", "orbits", "continuation", "design", "maps")
+FOLDERS = tuple(f"vijax/{name}" for name in _LAYERS)
+EXPECTED_SURVIVORS = ROOT / "tests/mutants.toml"
 _SIGNS = {ast.Add: ("+", "-"), ast.Sub: ("-", "+")}
 _COMPARISONS = {
     ast.Lt: ("<", "<="),
@@ -39,7 +40,7 @@ _COMPARISONS = {
     ast.Eq: ("==", "!="),
     ast.NotEq: ("!=", "=="),
 }
-# Functions whose result does not depend on the order of their arguments, and those whose arguments are no numbers.
+# Functions with a result independent of the order of the arguments, and functions of non-numeric arguments.
 _SYMMETRIC = {
     "maximum",
     "minimum",
@@ -52,18 +53,18 @@ _SYMMETRIC = {
     "getattr",
     "setattr",
 }
-_PASSED, _NO_TESTS = 0, 5  # exit statuses of pytest; files whose tests are all long have none to run
+_PASSED, _NO_TESTS = 0, 5  # exit statuses of pytest; a file of long tests has no test to run
 
 
 class Mutant(NamedTuple):
     """A change of one line.
 
     Attributes:
-        path: Of the file, relative to the root of the repository.
+        path: Path of the file, relative to the root of the repository.
         line: Number of the line.
         kind: "sign", "constant", "comparison" or "arguments".
         old: The line as it is.
-        new: The line as it is changed to.
+        new: The line after the change.
     """
 
     path: str
@@ -77,12 +78,12 @@ class Mutant(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What the tests made of a mutant.
+    """Outcome of the tests of a mutant.
 
     Attributes:
         mutant: The change.
         caught_by: The first test that failed; "" if none did.
-        seconds: Time that its tests took.
+        seconds: Time of its tests.
         files: Number of test files that ran.
     """
 
@@ -92,23 +93,23 @@ class Outcome(NamedTuple):
     files: int
 
 
-# --- which changes ---------------------------------------------------------------------------------------------------
+# --- mutants ---------------------------------------------------------------------------------------------------------
 
 
 def mutants(path: Path) -> list[Mutant]:
     """Return every change that can be made to one file, in the order of its lines."""
     text = path.read_text(encoding="utf-8")
     lines, relative = text.splitlines(), path.relative_to(ROOT).as_posix()
-    found = []
+    changes = []
     for node in _numeric(ast.parse(text)):
         for kind, start, end, new in _changes(node, lines):
             line = lines[node.lineno - 1]
-            found.append(Mutant(relative, node.lineno, kind, line, line[:start] + new + line[end:]))
-    return found
+            changes.append(Mutant(relative, node.lineno, kind, line, line[:start] + new + line[end:]))
+    return changes
 
 
 def draw(paths: Iterable[Path], count: int, seed: int) -> list[Mutant]:
-    """Return mutants drawn at random, each kind as often as the others, at most one of a line."""
+    """Return mutants drawn at random, balanced between kinds, at most one per line."""
     by_kind: dict[str, list[Mutant]] = {}
     for path in paths:
         for mutant in mutants(path):
@@ -126,7 +127,7 @@ def draw(paths: Iterable[Path], count: int, seed: int) -> list[Mutant]:
 
 
 def _numeric(tree: ast.AST) -> Iterator[ast.expr]:
-    """Yield the expressions of a file that compute: none of annotations, decorators, errors or texts."""
+    """Yield the expressions of a file that compute, without annotations, decorators, errors and texts."""
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.Raise | ast.JoinedStr | ast.arguments | ast.Assert):
             continue
@@ -163,8 +164,8 @@ def _changes(node: ast.expr, lines: list[str]) -> Iterator[tuple[str, int, int, 
         yield "constant", node.col_offset, int(node.end_col_offset or 0), new
     elif isinstance(node, ast.Call) and _name(node.func) not in _SYMMETRIC:
         for first, second in zip(node.args, node.args[1:], strict=False):
-            old = [line[one.col_offset : one.end_col_offset] for one in (first, second)]
-            if old[0] != old[1] and not any(isinstance(one, ast.Starred | ast.Lambda) for one in (first, second)):
+            old = [line[item.col_offset : item.end_col_offset] for item in (first, second)]
+            if old[0] != old[1] and not any(isinstance(item, ast.Starred | ast.Lambda) for item in (first, second)):
                 between = line[first.end_col_offset : second.col_offset]
                 yield "arguments", first.col_offset, int(second.end_col_offset or 0), old[1] + between + old[0]
 
@@ -172,7 +173,7 @@ def _changes(node: ast.expr, lines: list[str]) -> Iterator[tuple[str, int, int, 
 def _operator(
     kind: str, line: str, left: ast.expr, right: ast.expr, old: str, new: str
 ) -> Iterator[tuple[str, int, int, str]]:
-    """Yield the change of an operator between two operands, if it can be told from brackets beside it."""
+    """Yield the change of an operator between two operands, if it is unambiguous among brackets next to it."""
     start, end = int(left.end_col_offset or 0), right.col_offset
     if line[start:end].count(old) == 1:
         place = line.index(old, start)
@@ -183,7 +184,7 @@ def _name(function: ast.expr) -> str:
     return function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
 
 
-# --- what the tests make of them -------------------------------------------------------------------------------------
+# --- outcomes --------------------------------------------------------------------------------------------------------
 
 
 def run(mutant: Mutant, copy: Path, most_seconds: float) -> Outcome:
@@ -191,8 +192,8 @@ def run(mutant: Mutant, copy: Path, most_seconds: float) -> Outcome:
 
     Args:
         mutant: The change; it is undone afterwards.
-        copy: The copy, in which nothing else runs.
-        most_seconds: Recorded time of the test files that may run at most; the nearest run whatever they take.
+        copy: The copy, not used by other runs.
+        most_seconds: Limit of the recorded time of the test files; the nearest files run in any case.
     """
     module = mutant.path.removesuffix(".py").replace("/", ".")
     files, spent = dependent_files(module), 0.0
@@ -216,7 +217,7 @@ def run(mutant: Mutant, copy: Path, most_seconds: float) -> Outcome:
 
 
 def _pytest(copy: Path, files: list[str], timeout: float) -> str:
-    """Run test files and return the first failure; a run that does not end within `timeout` seconds is one, too."""
+    """Run test files and return the first failure; a run that exceeds `timeout` seconds is a failure, too."""
     environment = os.environ | {"PYTHONPATH": str(copy), "CI": "true"}
     command = [sys.executable, "-m", "pytest", "-x", "-q", "--no-header", *files]
     try:
@@ -230,7 +231,7 @@ def _pytest(copy: Path, files: list[str], timeout: float) -> str:
 
 
 def copies(number: int, folder: Path) -> list[Path]:
-    """Copy the repository so many times, without what git ignores."""
+    """Copy the repository several times, without ignored files."""
     made = []
     for place in range(number):
         copy = folder / f"copy{place}"
@@ -243,14 +244,14 @@ def copies(number: int, folder: Path) -> list[Path]:
     return made
 
 
-def known() -> dict[tuple[str, str, str], str]:
-    """Return the reasons of mutants that are known to survive, by file, old line and new line without indentation."""
-    listed = tomllib.loads(KNOWN.read_text(encoding="utf-8")).get("mutant", [])
-    return {(one["path"], one["old"], one["new"]): one["reason"] for one in listed}
+def expected_survivors() -> dict[tuple[str, str, str], str]:
+    """Return reasons of expected survivors, by file, old line and new line without indentation."""
+    listed = tomllib.loads(EXPECTED_SURVIVORS.read_text(encoding="utf-8")).get("mutant", [])
+    return {(entry["path"], entry["old"], entry["new"]): entry["reason"] for entry in listed}
 
 
 def outcomes(drawn: list[Mutant], workers: int, most_seconds: float) -> Iterator[Outcome]:
-    """Run the tests of each mutant, several mutants at once, and yield the outcomes as they come."""
+    """Run the tests of each mutant, several mutants at once, and yield the outcomes in the order of completion."""
     free: SimpleQueue[Path] = SimpleQueue()
 
     def in_a_copy(mutant: Mutant) -> Outcome:
@@ -272,10 +273,10 @@ def outcomes(drawn: list[Mutant], workers: int, most_seconds: float) -> Iterator
 
 
 def main() -> int:
-    """Run the command line; the exit status is 1 if fewer mutants are caught than `--least` demands."""
+    """Run the command line; the exit status is 1 if the caught share is less than `--least`."""
     options = _parser().parse_args()
     paths = sorted(path for name in options.only for path in _python_files(ROOT / name))
-    drawn, reasons = draw(paths, options.count, options.seed), known()
+    drawn, reasons = draw(paths, options.count, options.seed), expected_survivors()
     if options.list:
         print(*drawn, sep="\n")
         return 0
@@ -285,14 +286,14 @@ def main() -> int:
         reason = reasons.get((mutant.path, mutant.old.strip(), mutant.new.strip()), "")
         if outcome.caught_by:
             caught += 1
-            verdict = f"caught by {outcome.caught_by}"
+            result = f"caught by {outcome.caught_by}"
         elif reason:
             harmless += 1
-            verdict = f"no effect: {reason}"
+            result = f"no effect: {reason}"
         else:
             survivors.append(mutant)
-            verdict = f"SURVIVED {outcome.files} test files"
-        print(f"{mutant}\n    {verdict}, {outcome.seconds:.0f} s", flush=True)
+            result = f"SURVIVED {outcome.files} test files"
+        print(f"{mutant}\n    {result}, {outcome.seconds:.0f} s", flush=True)
     share = caught / max(caught + len(survivors), 1)
     print(f"{caught} of {caught + len(survivors)} caught ({100 * share:.1f} %); {harmless} are known to have no effect")
     print(*(f"survived: {mutant}" for mutant in survivors), sep="\n")

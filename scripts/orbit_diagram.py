@@ -1,15 +1,15 @@
 """An orbit diagram: `vijax orbit-diagram`.
 
 python scripts/orbit_diagram.py
-python scripts/orbit_diagram.py --help  # options, and more lines to begin with
+python scripts/orbit_diagram.py --help  # options and examples
 """
 
-from vijax.cli.orbit_diagram import orbit_diagram
+from vijax.cli.commands.orbit_diagram import orbit_diagram
 from vijax.cli.process import command, run
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command and give its exit code; see `process.run`."""
+    """Run the command and return its exit code; see `process.run`."""
     return run(orbit_diagram, arguments)
 
 

@@ -1,7 +1,7 @@
 """Print or run the test files that import a module of vijax.
 
-    python scripts/tests_for.py vijax/orbits/criticality.py                  # print the files
-    python scripts/tests_for.py vijax.orbits.criticality --run -x -k flip    # run them; pytest gets what follows --run
+    python scripts/tests_for.py vijax/continuation/criticality.py    # print the files
+    python scripts/tests_for.py vijax.model.flow --run -x -k flip    # run them; arguments after --run: pytest
 
 A file has distance 1 if it imports the module, or uses a public name that the module defines; it has distance 2 if it
 imports a module that imports the module, and so on. By default the nearest files are chosen. Files are ordered by
@@ -17,9 +17,9 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from scripts import house
+from scripts import import_layers
 from tests.seconds import recorded
-from vijax.runtime.offered import homes
+from vijax.runtime.lazy_imports import name_locations
 
 ROOT = Path(__file__).parent.parent
 
@@ -28,7 +28,7 @@ class DependentFile(NamedTuple):
     """A test file that depends on a module.
 
     Attributes:
-        path: Of the file, relative to the root of the repository.
+        path: Path of the file, relative to the root of the repository.
         distance: Number of imports between the file and the module.
         seconds: Processor time of its tests; 0 if none is recorded.
     """
@@ -42,8 +42,8 @@ def dependent_files(module: str, imports: Mapping[str, set[str]] | None = None) 
     """Return the test files that depend on a module, nearest first, then cheapest first.
 
     Args:
-        module: Dotted name, such as "vijax.orbits.criticality".
-        imports: Modules that each module imports; read from the repository unless given.
+        module: Dotted name, such as "vijax.continuation.criticality".
+        imports: Modules that each module imports; by default read from the repository.
 
     Raises:
         ValueError: If the repository has no such module.
@@ -53,12 +53,12 @@ def dependent_files(module: str, imports: Mapping[str, set[str]] | None = None) 
         raise ValueError(f"MODULE must be a module of the repository; got {module!r}; give it as vijax.orbits.steady")
     distances = _distances(module, imports)
     seconds = recorded()
-    found = [
+    files = [
         DependentFile(path, distances[name], seconds.get(path, 0.0))
         for name in distances
         if (path := f"{name.replace('.', '/')}.py").startswith("tests/") and Path(path).name.startswith("test_")
     ]
-    return sorted(found, key=lambda file: (file.distance, file.seconds, file.path))
+    return sorted(files, key=lambda file: (file.distance, file.seconds, file.path))
 
 
 def _distances(module: str, imports: Mapping[str, set[str]]) -> dict[str, int]:
@@ -74,7 +74,7 @@ def _distances(module: str, imports: Mapping[str, set[str]]) -> dict[str, int]:
 @cache
 def _imports() -> dict[str, set[str]]:
     """Return the modules that each module of the repository imports, public names replaced by their modules."""
-    public = {name: home.module for name, home in homes("vijax", ROOT / "vijax/public.py").items()}
+    public = {name: home.module for name, home in name_locations("vijax", ROOT / "vijax/public.py").items()}
     paths = [path for folder in ("vijax", "tests", "benchmarks", "scripts") for path in (ROOT / folder).rglob("*.py")]
     modules = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in paths}
     # `vijax/public.py` imports everything; a dependency on it is a dependency on each name that is used.
@@ -82,7 +82,10 @@ def _imports() -> dict[str, set[str]]:
     imports = {}
     for name, path in modules.items():
         parsed = ast.parse(path.read_text(encoding="utf-8"))
-        names = {part for one in house.imported(parsed) for part in (one, one.rpartition(".")[0])}
+        # An imported name is a module, or an object inside of its parent module.
+        names = {
+            part for target in import_layers.imported_names(parsed) for part in (target, target.rpartition(".")[0])
+        }
         names |= {public[used] for used in _public_names(parsed) if used in public}
         imports[name] = (names & set(modules)) - {name} - ignored
     return {name: others for name, others in imports.items() if name not in ignored}
@@ -100,7 +103,7 @@ def _public_names(parsed: ast.Module) -> set[str]:
 
 
 def _module_name(text: str) -> str:
-    """Return the dotted name of a module that is given as a path or as a dotted name."""
+    """Return the dotted name of a module from its path or dotted name."""
     return text.removesuffix(".py").replace("/", ".") if "/" in text or text.endswith(".py") else text
 
 
@@ -111,7 +114,7 @@ def main() -> int:
         description=description, epilog=details, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("module", metavar="MODULE", type=_module_name, help="path or dotted name of a module")
-    parser.add_argument("--distance", type=int, help="largest distance of the files (default: that of the nearest)")
+    parser.add_argument("--distance", type=int, help="largest distance of the files (default: the smallest distance)")
     parser.add_argument(
         "--run", nargs=argparse.REMAINDER, help="run the files by pytest, with the arguments that follow"
     )

@@ -1,4 +1,4 @@
-"""Settings every test runs under: strict dtype promotion, and property tests that CI draws the same way each time."""
+"""Settings of all tests: strict dtype promotion, and property tests that CI draws the same way each time."""
 
 import ctypes
 import gc
@@ -12,8 +12,8 @@ from hypothesis import settings
 
 import vijax  # noqa: F401  switches x64 on before a test makes its first array
 from tests import seconds
-from tests.xla_flags import known_flags
-from vijax.runtime.garbage import SELDOM
+from tests.xla_flags import supported_flags
+from vijax.runtime.garbage_collection import RELAXED_THRESHOLDS
 
 # XLA reads its flags when JAX first computes, here and in the scripts that tests start. Tests mostly compile, and with
 # these flags a program compiles in a third of the time. Flags that XLA_FLAGS holds already come last and win.
@@ -22,9 +22,9 @@ _FLAGS = (
     "--xla_cpu_use_fusion_emitters=false",
     # Workers keep the cores busy already; cutting a program into parts to compile them side by side costs a tenth.
     "--xla_cpu_parallel_codegen_split_count=1",
-    # The first as always (`runtime.xla`); the others walk a program again and again, to check it or to look for
-    # what ours do not contain, and no test waits for what they find. Not reshape-mover, too: without it and algsimp
-    # a loop that draws by `jax.random` writes where it should not.
+    # The first as always (`runtime.compilation.xla`). The others traverse a program many times, to verify it or to
+    # search for patterns that programs of vijax do not contain. reshape-mover is not skipped: without it and algsimp, a
+    # loop that draws by `jax.random` writes to wrong addresses.
     "--xla_disable_hlo_passes=cpu-parallel-task-assigner,hlo-verifier,algsimp,simplify-while-loops,"
     "while-loop-invariant-code-motion,while-loop-constant-sinking,simplify-conditional,"
     "tree_reduction_rewriter,zero_sized_hlo_elimination",
@@ -32,11 +32,11 @@ _FLAGS = (
 # "quick" in processes that inherit the flags, as the workers of pytest-xdist do; "shipped" where the tests are to
 # compile as users do (scripts/check.sh --shipped).
 if "VIJAX_TEST_FLAGS" not in os.environ:
-    os.environ["XLA_FLAGS"] = " ".join((*known_flags(_FLAGS), os.environ.get("XLA_FLAGS", "")))
+    os.environ["XLA_FLAGS"] = " ".join((*supported_flags(_FLAGS), os.environ.get("XLA_FLAGS", "")))
     os.environ["VIJAX_TEST_FLAGS"] = "quick"
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-gc.set_threshold(*SELDOM)  # tests trace outside of public functions, too
+gc.set_threshold(*RELAXED_THRESHOLDS)  # tests trace outside of public functions, too
 # Workers, and the scripts that tests start, compile many of the same programs: one of them does it for all.
 CACHE = str(Path(__file__).parent.parent / ".pytest_cache" / "jax")
 os.environ["JAX_COMPILATION_CACHE_DIR"] = CACHE
@@ -50,24 +50,24 @@ settings.register_profile("vijax-ci", settings.get_profile("vijax"), derandomize
 settings.load_profile("vijax-ci" if os.environ.get("CI") else "vijax")
 
 
-# Bytes of a worker beyond which it forgets its programs: two of them, and what they start, share the memory of a small
-# machine, and what LLVM makes of thousands of programs is most of it. They are read from the folder again.
-MOST_MEMORY = 5e9
+# A worker with more bytes than this drops its programs and reads them from the folder again. Two workers and their
+# child processes share the memory of a small machine; machine code of thousands of programs is most of it.
+MAX_MEMORY = 5e9
 
 
 def pytest_runtest_teardown(item, nextitem):
-    """Forget compiled programs between two files, where they have become too many."""
-    if nextitem is not None and nextitem.path != item.path and resident() > MOST_MEMORY:
+    """Drop compiled programs between two files if the process has too much memory."""
+    if nextitem is not None and nextitem.path != item.path and resident() > MAX_MEMORY:
         jax.clear_caches()
         gc.collect()
-        # What is freed stays with the process unless glibc is told; other libraries of C give it back, or do not know.
+        # glibc returns freed memory to the system only on request; other C libraries have no such function.
         getattr(ctypes.CDLL(None), "malloc_trim", int)(0)
 
 
 def resident() -> float:
-    """Say how many bytes this process has in memory; 0 where that is not told."""
-    told = Path("/proc/self/statm")
-    return float(told.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if told.exists() else 0.0
+    """Return the resident memory of this process in bytes; 0 if the system does not report it."""
+    status = Path("/proc/self/statm")
+    return float(status.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if status.exists() else 0.0
 
 
 def pytest_addoption(parser):
@@ -86,13 +86,13 @@ def pytest_collection_modifyitems(config, items):
         items.sort(key=lambda item: -seconds_of.get(_file(item.nodeid), math.inf))
     if config.getoption("--long") or any("::" in argument for argument in config.args):
         return
-    left = [item for item in items if "long" in item.keywords]
+    deselected = [item for item in items if "long" in item.keywords]
     items[:] = [item for item in items if "long" not in item.keywords]
-    config.hook.pytest_deselected(items=left)
+    config.hook.pytest_deselected(items=deselected)
 
 
 def pytest_collection_finish():
-    """Begin to count processor time: what came before belongs to no file."""
+    """Start to count processor time; earlier time belongs to no file."""
     _last_report[0] = sum(os.times()[:4])
 
 
@@ -109,12 +109,12 @@ def pytest_runtest_makereport(item, call):
 def pytest_runtest_logreport(report):
     """Add up the processor time of each file; with several workers this runs in the process that collects reports."""
     file = _file(report.nodeid)
-    taken = sum(value for name, value in report.user_properties if name == _SECONDS)
-    _seconds_of[file] = _seconds_of.get(file, 0.0) + taken
+    duration = sum(value for name, value in report.user_properties if name == _SECONDS)
+    _seconds_of[file] = _seconds_of.get(file, 0.0) + duration
 
 
 def pytest_sessionfinish(session):
-    """Write the processor time of each file, where the option is given."""
+    """Write the processor time of each file if the option is set."""
     if session.config.getoption("--record-seconds") and not hasattr(session.config, "workerinput"):
         seconds.record(seconds.recorded() | _seconds_of)
 
@@ -125,13 +125,13 @@ _seconds_of: dict[str, float] = {}
 
 
 def _file(nodeid: str) -> str:
-    """Return the path of the file that a test stands in, relative to the root of the repository."""
+    """Return the path of a test's file, relative to the root of the repository."""
     return nodeid.partition("::")[0]
 
 
 @pytest.fixture
 def on_gpu(monkeypatch):
-    """Trace as for a GPU; what was traced for this CPU is forgotten before and after."""
+    """Return a function that makes JAX trace for a GPU; traces for the CPU are dropped before and after."""
 
     def begin():
         jax.clear_caches()

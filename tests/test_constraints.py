@@ -23,12 +23,12 @@ def test_the_file_fits_the_version_of_python(version, file):
 
 
 def test_the_module_prints_the_file_for_the_python_that_runs_it():
-    found = subprocess.run([sys.executable, "-m", "scripts.constraints"], cwd=ROOT, capture_output=True, text=True)
-    assert found.stdout == f"{constraints.file_for(sys.version_info[:2])}\n"
+    process = subprocess.run([sys.executable, "-m", "scripts.constraints"], cwd=ROOT, capture_output=True, text=True)
+    assert process.stdout == f"{constraints.file_for(sys.version_info[:2])}\n"
 
 
 @pytest.mark.parametrize("file", FILES)
-def test_every_requirement_has_a_version_that_the_package_accepts(file):
+def test_all_requirements_have_a_version_that_the_package_accepts(file):
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     texts = [*project["dependencies"], *(text for extra in project["optional-dependencies"].values() for text in extra)]
     pinned = constraints.pinned(file)
@@ -39,7 +39,7 @@ def test_every_requirement_has_a_version_that_the_package_accepts(file):
 
 
 @pytest.mark.parametrize("file", FILES)
-def test_every_line_is_a_comment_or_one_version(file):
+def test_all_lines_are_comments_or_single_versions(file):
     lines = (ROOT / file).read_text(encoding="utf-8").splitlines()
     pins = [line for line in lines if not line.startswith("#")]
     assert len(constraints.pinned(file)) == len(pins)

@@ -1,4 +1,4 @@
-"""`scripts/mutants.py` draws changes of one line, and tells those that tests notice from those that they do not."""
+"""`scripts/mutants.py` draws changes of one line, and separates detected from undetected changes."""
 
 import ast
 from collections import Counter
@@ -29,9 +29,9 @@ def file(tmp_path, monkeypatch):
 
 
 def test_only_lines_that_compute_are_changed(file):
-    found = [(one.kind, one.new.strip()) for one in mutants.mutants(file)]
+    changes = [(change.kind, change.new.strip()) for change in mutants.mutants(file)]
     result = "return -larger(low - LIMIT, high) + max(low, high)"
-    assert sorted(found) == sorted(
+    assert sorted(changes) == sorted(
         [
             ("constant", "LIMIT = 3.3000000000000003"),
             ("comparison", "if low <= 0:"),
@@ -44,17 +44,17 @@ def test_only_lines_that_compute_are_changed(file):
     )
 
 
-def test_a_draw_is_the_same_for_a_seed_and_has_every_kind():
+def test_a_draw_is_the_same_for_a_seed_and_has_all_kinds():
     paths = sorted((mutants.Path(mutants.ROOT) / "vijax/model").glob("*.py"))
     drawn = mutants.draw(paths, 40, seed=0)
     assert drawn == mutants.draw(paths, 40, seed=0)
     assert drawn != mutants.draw(paths, 40, seed=1)
-    assert len({(one.path, one.line) for one in drawn}) == 40
-    assert min(Counter(one.kind for one in drawn).values()) >= 9
-    for one in drawn:
-        lines = (mutants.ROOT / one.path).read_text().split("\n")
-        assert lines[one.line - 1] == one.old != one.new
-        lines[one.line - 1] = one.new
+    assert len({(change.path, change.line) for change in drawn}) == 40
+    assert min(Counter(change.kind for change in drawn).values()) >= 9
+    for change in drawn:
+        lines = (mutants.ROOT / change.path).read_text().split("\n")
+        assert lines[change.line - 1] == change.old != change.new
+        lines[change.line - 1] = change.new
         ast.parse("\n".join(lines))
 
 
@@ -71,15 +71,15 @@ def test_a_mutant_is_caught_by_the_first_test_that_fails_and_is_undone(file, mon
     (tmp_path / "test_more.py").write_text("def test_more():\n    pass\n")
     files = [DependentFile("test_gap.py", 1, 0.0), DependentFile("test_more.py", 2, 500.0)]
     monkeypatch.setattr(mutants, "dependent_files", lambda module: files)
-    (mutant,) = [one for one in mutants.mutants(file) if one.line == 3]
+    (mutant,) = [change for change in mutants.mutants(file) if change.line == 3]
     outcome = mutants.run(mutant, tmp_path, most_seconds=100.0)
     assert outcome.caught_by == caught_by
     assert outcome.files == 1
     assert file.read_text() == SOURCE
 
 
-def test_reasons_of_known_mutants_are_those_of_lines_that_exist():
-    for path, old, new in mutants.known():
+def test_expected_survivors_are_changes_of_existing_lines():
+    for path, old, new in mutants.expected_survivors():
         lines = [line.strip() for line in (mutants.ROOT / path).read_text().split("\n")]
         assert old in lines
         assert old != new

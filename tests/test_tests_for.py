@@ -1,4 +1,4 @@
-"""`scripts/tests_for.py` finds the test files that depend on a module, and the order in which pytest runs files."""
+"""`scripts/tests_for.py` lists the test files that depend on a module; recorded seconds order the files."""
 
 import subprocess
 import sys
@@ -22,7 +22,7 @@ IMPORTS = {
 }
 
 
-def test_files_are_found_by_distance_then_by_seconds(monkeypatch):
+def test_files_are_ordered_by_distance_then_by_seconds(monkeypatch):
     monkeypatch.setattr(tests_for, "recorded", lambda: {"tests/test_dear.py": 9.0, "tests/test_cheap.py": 1.5})
     assert tests_for.dependent_files("package.low", IMPORTS) == [
         ("tests/test_low.py", 1, 0.0),
@@ -37,8 +37,8 @@ def test_files_are_found_by_distance_then_by_seconds(monkeypatch):
 def test_a_test_of_a_public_name_depends_on_the_module_that_defines_it():
     nearest = tests_for.dependent_files("vijax.orbits.steady")
     assert ("tests/orbits/test_steady.py", 1) in [file[:2] for file in nearest]
-    assert "tests/orbits/test_curves.py" in [
-        file.path for file in tests_for.dependent_files("vijax.orbits.criticality")
+    assert "tests/continuation/test_curves.py" in [
+        file.path for file in tests_for.dependent_files("vijax.continuation.criticality")
     ]
 
 
@@ -47,11 +47,11 @@ def test_the_command_runs_the_nearest_files(monkeypatch, capsys):
     monkeypatch.setattr(
         subprocess, "run", lambda command, **_: started.append(command) or SimpleNamespace(returncode=3)
     )
-    monkeypatch.setattr(sys, "argv", ["tests_for.py", "vijax/runtime/lattice.py", "--run", "-x", "-q"])
+    monkeypatch.setattr(sys, "argv", ["tests_for.py", "vijax/runtime/numerics/low_discrepancy.py", "--run", "-x", "-q"])
     assert tests_for.main() == 3
     ((_, _, pytest_name, *arguments),) = started
     assert (pytest_name, arguments[-2:]) == ("pytest", ["-x", "-q"])
-    assert "tests/runtime/test_lattice.py" in arguments
+    assert "tests/runtime/test_low_discrepancy.py" in arguments
     assert f"{len(arguments) - 2} files" in capsys.readouterr().out
 
 

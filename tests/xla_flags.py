@@ -1,4 +1,4 @@
-"""Flags of XLA that tests run under, without those that the installed XLA does not know."""
+"""Flags of XLA for tests, without flags that the installed XLA does not support."""
 
 import os
 import re
@@ -8,10 +8,10 @@ import sys
 _STARTS_XLA = "from jaxlib import xla_client; xla_client.make_cpu_client()"
 
 
-def known_flags(flags: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the flags that the installed XLA knows.
+def supported_flags(flags: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the flags that the installed XLA supports.
 
-    A process ends at a flag in XLA_FLAGS that its XLA does not know. A process of its own therefore tries them.
+    A process ends at a flag in XLA_FLAGS that its XLA does not support. A child process therefore tries them.
 
     Raises:
         RuntimeError: The process ended for another reason.

@@ -1,13 +1,13 @@
-"""The command `vijax`, which `python -m vijax` is too."""
+"""Entry point of the command `vijax`, also run by `python -m vijax`."""
 
 from typing import NoReturn
 
 
 def command() -> NoReturn:
-    """Run the command as a shell calls it: the process ends with its exit code."""
+    """Run the command for a shell: the process ends with its exit code."""
     from vijax.cli import signals
 
-    signals.own_process()  # before anything is imported that takes time
+    signals.own_signals()  # before any slow import
     from vijax.cli.main import main
     from vijax.cli.process import leave
 

@@ -1,58 +1,49 @@
-"""What `import vijax` offers, and where: `vijax.__init__` reads these lines, and loads a name as it is asked for."""
+"""Public names of vijax and their modules: `vijax.__init__` parses these lines, and imports a name at first use."""
 
 from typing import TYPE_CHECKING
 
-from vijax.batch.run_records import Trajectory
-from vijax.batch.trajectory import trajectory
-from vijax.design.average import Average, Smoothness, average
+from vijax.continuation.branch_continuation import Branch, follow_orbits
+from vijax.continuation.branch_dataset import branch_dataset
+from vijax.continuation.branch_switching import follow_families
+from vijax.continuation.continuation_settings import ContinuationSettings
+from vijax.continuation.curves.curve_dataset import curve_dataset
+from vijax.continuation.curves.curve_table import curve_rows
+from vijax.continuation.curves.curves import BifurcationCurve, follow_curves
+from vijax.continuation.curves.orbit_curves import curves_about
+from vijax.continuation.from_map.map_curves import MapCurves, bifurcation_curves
+from vijax.continuation.limits import limit_points
+from vijax.design.aperiodic.average import Average, Smoothness, average
 from vijax.design.design_settings import DesignSettings
-from vijax.design.off_design import arrival as design_arrival
-from vijax.design.off_design import extents as design_extents
-from vijax.design.optimise import Design, optimise
-from vijax.design.optimise import under as under_tolerances
+from vijax.design.optimise import Design, optimise, tolerance_statistics
 from vijax.design.optimum import AperiodicOptimum, Optimum
-from vijax.design.robustness import Surroundings, surroundings
-from vijax.design.robustness import weighted as weigh_basins
-from vijax.design.tolerance import Tolerance
-from vijax.design.tolerance_plane import TolerancePlane
-from vijax.design.tolerance_plane import tolerance_plane as design_plane
-from vijax.explorer.door import explore
+from vijax.design.robustness.off_design import arrival_statistics, parameter_ranges
+from vijax.design.robustness.surroundings import Surroundings, maximise_basin_power, surroundings
+from vijax.design.robustness.tolerance import Tolerance
+from vijax.design.robustness.tolerance_plane import TolerancePlane, tolerance_plane
+from vijax.explorer.explore import explore
 from vijax.fitting.fit import fit
-from vijax.fitting.fitted import ConstancyTest, Fit, Misfit
+from vijax.fitting.fit_result import ConstancyTest, Fit, Misfit
+from vijax.maps.basins import basin_fractions, basins
+from vijax.maps.chaos import lyapunov, survival
+from vijax.maps.compare import cheapest_model, compare, rigid_from
+from vijax.maps.orbit_diagram import orbit_diagram
+from vijax.maps.response import response
+from vijax.maps.storage.store import load, save
+from vijax.maps.sweep import sweep
 from vijax.model.device import Harvester
 from vijax.model.energy import harvested_energy
-from vijax.model.excitation import Excitation, Harmonics, Noise, Record, Waveform
-from vijax.model.laws import HuntCrossley, Hyperelastic
-from vijax.model.membrane import MembraneLaw
+from vijax.model.forcing.excitation import Excitation, Harmonics, Noise, Record, Waveform
 from vijax.model.pair import ImpactPair, impact_pair
 from vijax.model.records import Impact, State, Status
-from vijax.model.sides import Sides
-from vijax.orbits.branch_dataset import dataset as branch_dataset
-from vijax.orbits.continuation import Branch
-from vijax.orbits.continuation import follow as follow_orbits
-from vijax.orbits.continuation_settings import ContinuationSettings
-from vijax.orbits.curve_dataset import curve_dataset
-from vijax.orbits.curve_rows import curve_rows
-from vijax.orbits.curves import BifurcationCurve, follow_curves
-from vijax.orbits.limits import limit_points
-from vijax.orbits.map_curves import MapCurves, bifurcation_curves
-from vijax.orbits.orbit_curves import curves_about
-from vijax.orbits.orbit_properties import impacts as orbit_impacts
-from vijax.orbits.orbit_properties import labels as orbit_labels
-from vijax.orbits.orbit_properties import path as orbit_path
-from vijax.orbits.orbit_properties import power as orbit_power
-from vijax.orbits.orbit_search import from_state as orbits_from_states
-from vijax.orbits.orbit_search import search as find_orbits
+from vijax.model.walls.laws import HuntCrossley, Hyperelastic
+from vijax.model.walls.membrane import MembraneLaw
+from vijax.model.walls.sides import Sides
+from vijax.orbits.orbit_properties import orbit_impacts, orbit_labels, orbit_path, orbit_power
+from vijax.orbits.orbit_search import find_orbits, orbits_from_states
 from vijax.orbits.periodic import Orbit
 from vijax.orbits.steady import Steady, steady
-from vijax.orbits.switching import family as follow_families
-from vijax.planes.basins import basin_fractions, basins
-from vijax.planes.chaos import lyapunov, survival
-from vijax.planes.compare import cheapest_model, compare, rigid_from
-from vijax.planes.orbit_diagram import orbit_diagram
-from vijax.planes.response import response
-from vijax.planes.store import load, save
-from vijax.planes.sweep import sweep
+from vijax.simulation.run_records import Trajectory
+from vijax.simulation.trajectory import trajectory
 
 if TYPE_CHECKING:
     import vijax.plots as plots
@@ -91,6 +82,7 @@ __all__ = [
     "TolerancePlane",
     "Trajectory",
     "Waveform",
+    "arrival_statistics",
     "average",
     "basin_fractions",
     "basins",
@@ -101,9 +93,6 @@ __all__ = [
     "curve_dataset",
     "curve_rows",
     "curves_about",
-    "design_arrival",
-    "design_extents",
-    "design_plane",
     "explore",
     "find_orbits",
     "fit",
@@ -115,6 +104,7 @@ __all__ = [
     "limit_points",
     "load",
     "lyapunov",
+    "maximise_basin_power",
     "optimise",
     "orbit_diagram",
     "orbit_impacts",
@@ -122,6 +112,7 @@ __all__ = [
     "orbit_path",
     "orbit_power",
     "orbits_from_states",
+    "parameter_ranges",
     "plots",
     "response",
     "rigid_from",
@@ -130,7 +121,7 @@ __all__ = [
     "surroundings",
     "survival",
     "sweep",
+    "tolerance_plane",
+    "tolerance_statistics",
     "trajectory",
-    "under_tolerances",
-    "weigh_basins",
 ]

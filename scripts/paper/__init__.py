@@ -1,4 +1,4 @@
-"""The paper once more: its figures 3 to 16, and its claims beside ours.
+"""Reproduction of the paper: its figures 3 to 16, and its claims beside the results of vijax.
 
-`captions` says what every figure shows, `__main__` is the command. Begin with `figures`.
+`captions` describes every figure, `__main__` is the command. Begin with `figures`.
 """

@@ -4,7 +4,7 @@
     python scripts/paper --figure all --into figures
     python scripts/paper --claims
 
-A figure N becomes figure_N.png in the folder; the claims are printed and become claims.md there.
+Figure N is written to figure_N.png in the folder; the claims are printed and written to claims.md there.
 """
 
 import time
@@ -29,7 +29,7 @@ def _options() -> list[click.Parameter]:
 @click.command(params=_options(), context_settings={"max_content_width": 120})
 def paper(figure: str | None, claims: bool, into: str, overwrite: bool) -> None:
     """Draw figures of the paper, and check its claims."""
-    with process.door():
+    with process.usage_errors():
         if figure is None and not claims:
             raise ValueError("figure must be given unless --claims is; got neither; try --figure 3")
         numbers = [] if figure is None else _numbers(figure)
@@ -63,9 +63,9 @@ def _draw(number: int, file: Path) -> None:
     from scripts.paper import figures
     from scripts.paper.captions import FIGURES
 
-    began = time.perf_counter()
+    start_time = time.perf_counter()
     figures.draw(number, file)
-    click.echo(f"Fig. {number} in {time.perf_counter() - began:.1f} s, wrote {file}")
+    click.echo(f"Fig. {number} in {time.perf_counter() - start_time:.1f} s, wrote {file}")
     if chosen := FIGURES[number].chosen:
         click.echo(f"  {chosen}")
 

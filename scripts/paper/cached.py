@@ -8,16 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from scripts.paper.captions import GAP_IN_METRES, Run
+from vijax.continuation import branch_continuation
+from vijax.continuation.continuation_settings import ContinuationSettings
+from vijax.maps.orbit_diagram import orbit_diagram
 from vijax.model.device import Harvester
 from vijax.model.pair import impact_pair
-from vijax.orbits import continuation, orbit_search, periodic
-from vijax.orbits.continuation_settings import ContinuationSettings
-from vijax.planes.orbit_diagram import orbit_diagram
+from vijax.orbits import orbit_search, periodic
 
 if TYPE_CHECKING:
     import xarray as xr
 
-_IMPACTS = 3  # orbits are padded to so many, so that one program follows the branches of several sequences
+_IMPACTS = 3  # padded width of orbits, so that all sequences use the same programs
 
 
 @lru_cache(maxsize=16)
@@ -37,31 +38,34 @@ def diagram(run: Run) -> "xr.Dataset":
 
 @lru_cache(maxsize=64)
 def orbits(walls: str, d: float, kappa: float | None, r: float = 0.5, period: int = 1) -> periodic.Orbit:
-    """Find every orbit with these walls, stable or not; kappa is None of rigid walls."""
-    return orbit_search.search(impact_pair(d, kappa, r), walls, period)
+    """Return all orbits with this sequence of walls, stable or not; kappa is None for rigid walls."""
+    return orbit_search.find_orbits(impact_pair(d, kappa, r), walls, period)
 
 
 @lru_cache(maxsize=32)
 def branches(
     walls: str, along: str, within: tuple[float, float], d: float, kappa: float | None, r: float = 0.5, period: int = 1
-) -> list[continuation.Branch]:
-    """Follow all orbits with these walls and no others; along omega those of the device of Figs. 12-16."""
-    found = orbits(walls, d, kappa, r, period)
-    if not len(found):
+) -> list[branch_continuation.Branch]:
+    """Return the branches of all orbits with this sequence of walls, without grazing switches.
+
+    A branch along omega uses the device of Figs. 12-16.
+    """
+    starts = orbits(walls, d, kappa, r, period)
+    if not len(starts):
         return []
     device = Harvester(s=GAP_IN_METRES) if along == "omega" else None
     settings = ContinuationSettings(max_grazings=0)
-    return continuation.follow(_padded(found), along, within, device=device, settings=settings)
+    return branch_continuation.follow_orbits(_padded(starts), along, within, device=device, settings=settings)
 
 
-def _padded(found: periodic.Orbit) -> periodic.Orbit:
-    width = found.knots.shape[1]
+def _padded(orbits_to_pad: periodic.Orbit) -> periodic.Orbit:
+    width = orbits_to_pad.impact_unknowns.shape[1]
 
     def pad(leaf: jax.Array) -> jax.Array:
-        if leaf.ndim < 2 or leaf.shape[1] != width or leaf is found.multipliers:
+        if leaf.ndim < 2 or leaf.shape[1] != width or leaf is orbits_to_pad.multipliers:
             return leaf
         blank = 0 if jnp.issubdtype(leaf.dtype, jnp.integer) else jnp.nan
         widths = [(0, 0), (0, max(_IMPACTS - width, 0)), *[(0, 0)] * (leaf.ndim - 2)]
         return jnp.pad(leaf, widths, constant_values=blank)
 
-    return jax.tree.map(pad, found)
+    return jax.tree.map(pad, orbits_to_pad)

@@ -1,46 +1,47 @@
-"""The paper's figures 3 to 16 as data: the runs behind them and what each panel shows.
+"""The paper's figures 3 to 16 as data: the runs behind the figures and the content of every panel.
 
-Where captions are silent or cannot be meant, a figure's `chosen` says what is drawn here. `paper.figures` draws them.
+Where a caption is incomplete or wrong, the field `chosen` of the figure states the choice made here. `paper.figures`
+draws the figures.
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from vijax.maps.orbit_diagram import Direction
 from vijax.model.choices import Walls
-from vijax.planes.orbit_diagram import Direction
 
-PERIODS, KEEP = 400, 25  # of every point of a diagram: run, and drawn
-SECTION_PERIODS = 3000  # of a Poincare section of chaos, which 25 points do not show
+PERIODS, RECORDED_PERIODS = 400, 25  # forcing periods of every point of a diagram: simulated, and drawn
+SECTION_PERIODS = 3000  # points of a Poincare section of chaos; 25 points are too few
 
 STIFFNESSES = (400.0, 126.5, 40.0, 12.65, 4.0)  # kappa of Figs. 8-11
 SPRINGS = (560.0, 56.0, 5.6, 0.56, 0.056)  # k [N/m] of Figs. 12-16: omega0 = 400, 126.5, 40, 12.65, 4 rad/s
-COLOURS = ("black", "tab:blue", "tab:green", "tab:orange", "tab:purple")  # of either, the stiffest first
+COLOURS = ("black", "tab:blue", "tab:green", "tab:orange", "tab:purple")  # of kappa and of k, the stiffest first
 RESTITUTIONS = (0.5, 0.1, 0.95)
 
 GAP_IN_METRES = 0.2  # of Figs. 12-16
 
 GAPS = tuple(np.round(np.arange(0.3, 0.0499, -0.002), 3).tolist())
 PHASE_PLANES = (0.16, 0.18, 0.2)  # d of Figs. 3 and 5
-UNSTABLE_AT = 0.18  # d of the 1:2 orbit in red
+UNSTABLE_AT = 0.18  # d of the red 1:2 orbit
 # Rigid branches over d: where 1:1 and 1:2 coexist, and how far they are followed (to the end of 1:1 in Fig. 12).
 BRANCHES_FROM, BRANCHES_WITHIN = 0.19, (0.05, 1.1)
 STIFFNESS_SWEEP = tuple((400 / np.arange(1, 134)).tolist())  # kappa = 400/n
-# The frequencies whose phase planes are drawn are points of the sweep too.
-SHOWN_FREQUENCIES = (np.pi / 3, np.pi, 7.79, 10.0, 10.5, 10.99)
-FREQUENCIES = tuple(np.union1d(np.round(np.arange(0.5, 15.0, 0.03), 2), SHOWN_FREQUENCIES).tolist())
+# The sweep includes the frequencies of the phase planes.
+PHASE_PLANE_FREQUENCIES = (np.pi / 3, np.pi, 7.79, 10.0, 10.5, 10.99)
+FREQUENCIES = tuple(np.union1d(np.round(np.arange(0.5, 15.0, 0.03), 2), PHASE_PLANE_FREQUENCIES).tolist())
 
 
 class Run(NamedTuple):
-    """One orbit diagram of the paper; hashable, so that figures and claims share its dataset.
+    """An orbit diagram of the paper; hashable, so that figures and claims share its dataset.
 
     Attributes:
-        along: The axis that is swept.
-        values: Its values.
+        along: Swept axis.
+        values: Values of the swept axis.
         axes: The other axes: name and value or values.
         direction: "down" or "up".
         wall: "soft" or "rigid".
-        periods, recorded_periods: Of every point, as in `orbit_diagram`.
+        periods, recorded_periods: Simulated and recorded periods of every point, as in `orbit_diagram`.
     """
 
     along: str
@@ -49,18 +50,18 @@ class Run(NamedTuple):
     direction: Direction = "down"
     wall: Walls = "soft"
     periods: int = PERIODS
-    recorded_periods: int = KEEP
+    recorded_periods: int = RECORDED_PERIODS
 
 
 class Source(NamedTuple):
-    """What a panel draws of a run, in one colour.
+    """Points of a run that a panel draws in one colour.
 
     Attributes:
         run: The run.
-        where: Values of the axes that have several, the swept one among them where a single one of it is drawn.
-        colour: As matplotlib names it.
-        text: In the legend, if anything.
-        mirror: Whether the mirror image (u, t) -> (-u, t + 1) is drawn.
+        where: Selected values of axes with several values, and of the swept axis if a single point is drawn.
+        colour: Colour of matplotlib.
+        text: Text in the legend; empty for none.
+        mirror: True to draw the mirror image (u, t) -> (-u, t + 1).
     """
 
     run: Run
@@ -74,12 +75,12 @@ class View(NamedTuple):
     """A panel.
 
     Attributes:
-        letter: In the layout.
-        shows: A quantity over the swept axis, or what is drawn at one value of it.
-        sources: Of what, the first below the others.
-        title: Above it.
-        levels: Whose impact velocities are dashed red lines.
-        unstable: Impact sequences whose unstable orbits, of the last source's parameters, are red.
+        letter: Letter of the panel in the layout.
+        shows: Quantity over the swept axis, or kind of plot at one value of the axis.
+        sources: Drawn sources, from the bottom to the top.
+        title: Title of the panel.
+        levels: Sources with impact velocities drawn as dashed red lines.
+        unstable: Impact sequences of unstable orbits, drawn in red at the parameters of the last source.
     """
 
     letter: str
@@ -94,34 +95,34 @@ class PaperFigure(NamedTuple):
     """A figure of the paper.
 
     Attributes:
-        title: What it is about.
+        title: Subject of the figure.
         layout: Rows of letters; a capital continues the panel of the small letter.
-        views: Its panels.
-        chosen: What the paper leaves open or prints wrongly, and what is drawn here.
-        marks: Values of the swept axis marked by dashed red lines.
+        views: Panels of the figure.
+        chosen: Choices made where the paper is incomplete or wrong.
+        reference_values: Values of the swept axis with dashed red lines.
     """
 
     title: str
     layout: tuple[str, ...]
     views: tuple[View, ...]
     chosen: str = ""
-    marks: tuple[float, ...] = ()
+    reference_values: tuple[float, ...] = ()
 
 
-def run(along: str, *values: float, **told: Any) -> Run:
-    """Make a `Run`: its settings by their names, everything else an axis."""
-    settings = {name: told.pop(name) for name in ("direction", "wall", "periods", "recorded_periods") if name in told}
-    return Run(along, values, tuple(told.items()), **settings)
+def run(along: str, *values: float, **axes: Any) -> Run:
+    """Return a `Run`; keyword arguments that are not settings of a `Run` are axes."""
+    settings = {name: axes.pop(name) for name in ("direction", "wall", "periods", "recorded_periods") if name in axes}
+    return Run(along, values, tuple(axes.items()), **settings)
 
 
-def _chaos(along: str, value: float, **told: Any) -> Run:
-    """Make a long run at one point, for a Poincare section."""
-    return run(along, value, periods=SECTION_PERIODS + PERIODS, recorded_periods=SECTION_PERIODS, **told)
+def _chaos(along: str, value: float, **axes: Any) -> Run:
+    """Return a long run at one point, for a Poincare section."""
+    return run(along, value, periods=SECTION_PERIODS + PERIODS, recorded_periods=SECTION_PERIODS, **axes)
 
 
 # --- the runs -------------------------------------------------------------------------------------
 
-# Unless a start is given it is 0.05853, -0.47898, the only one that the paper names for soft walls.
+# The default start is 0.05853, -0.47898, the only start that the paper names for soft walls.
 RIGID = run("d", *GAPS, r=0.5, wall="rigid", u0=0.13746, v0=0.61685)
 STIFF = run("d", *GAPS, r=0.5, kappa=400.0)
 BY_GAP = {r: run("d", *GAPS, r=r, kappa=STIFFNESSES) for r in RESTITUTIONS}
@@ -141,13 +142,13 @@ _SLOW = r"Slow impacts may have $\rho_j$ above the frame of (b)."
 _ENERGY = "Energies are microjoules, as Eq. (34) with Tables I and II gives them; the paper's mJ cannot be meant."
 
 
-def _each(letters: str, shows: tuple[str, ...], sources: tuple[Source, ...]) -> list[View]:
-    """Make panels of the same sources."""
-    return [View(letter, what, sources) for letter, what in zip(letters, shows, strict=True)]
+def _panels_of_sources(letters: str, shows: tuple[str, ...], sources: tuple[Source, ...]) -> list[View]:
+    """Return a panel for every quantity, with the same sources."""
+    return [View(letter, quantity, sources) for letter, quantity in zip(letters, shows, strict=True)]
 
 
 def _planes(letters: str, *sources: Source) -> list[View]:
-    """Make phase planes of the same sources at the three gaps of Figs. 3 and 5."""
+    """Return phase planes of the same sources at the three gaps of Figs. 3 and 5."""
     return [
         View(
             letter,
@@ -161,7 +162,7 @@ def _planes(letters: str, *sources: Source) -> list[View]:
 
 
 def _by_stiffness(r: float, **where: float) -> tuple[Source, ...]:
-    """Make sources of the five kappa of Figs. 8-11 in their colours."""
+    """Return the sources of the five kappa of Figs. 8-11 in their colours."""
     return tuple(
         Source(BY_GAP[r], {"kappa": kappa, **where}, colour, rf"$\kappa = {kappa:g}$")
         for kappa, colour in zip(STIFFNESSES, COLOURS, strict=True)
@@ -169,7 +170,7 @@ def _by_stiffness(r: float, **where: float) -> tuple[Source, ...]:
 
 
 def _by_spring(r: float, **where: float) -> tuple[Source, ...]:
-    """Make sources of the five k of Figs. 12-16 in their colours."""
+    """Return the sources of the five k of Figs. 12-16 in their colours."""
     return tuple(
         Source(BY_FREQUENCY[r], {"k": k, **where}, colour, f"$k = {k:g}$ N/m")
         for k, colour in zip(SPRINGS, COLOURS, strict=True)
@@ -181,7 +182,7 @@ def _at_gaps(r: float) -> PaperFigure:
     return PaperFigure(
         f"Soft walls over $d$, $r = {r}$",
         ("aabb", "aabb", "ccdd", "ccdd"),
-        tuple(_each("abcd", shows, _by_stiffness(r))),
+        tuple(_panels_of_sources("abcd", shows, _by_stiffness(r))),
     )
 
 
@@ -190,16 +191,19 @@ def _at_frequencies(r: float) -> PaperFigure:
     return PaperFigure(
         rf"Soft walls over $\omega$, $r = {r}$, $s = 0.2$ m",
         ("aabb", "aabb", "ccdd", "ccdd", "eeff", "eeff"),
-        tuple(_each("abcdef", shows, _by_spring(r))),
+        tuple(_panels_of_sources("abcdef", shows, _by_spring(r))),
         r"$\omega$ rises from 0.5 to 15 rad/s by 0.03, as the captions name no range. " + _SLOW + " " + _ENERGY + " On "
         "the softer membranes the formula gives more than the ball puts in.",
     )
 
 
-_FIRST, _IMAGE = Source(RIGID, {}, "black", "the sweep"), Source(RIGID, {}, "purple", "its mirror image", mirror=True)
-_HARD, _SOFT = Source(RIGID, {}, "magenta", "rigid"), Source(STIFF, {}, "black", r"soft, $\kappa = 400$")
-_HARD_W = Source(RIGID_BY_FREQUENCY, {}, "magenta", "rigid")
-_SOFT_W = Source(BY_FREQUENCY[0.5], {"k": 560.0}, "black", "soft, $k = 560$ N/m")
+_SWEEP_SOURCE, _MIRROR_SOURCE = (
+    Source(RIGID, {}, "black", "the sweep"),
+    Source(RIGID, {}, "purple", "its mirror image", mirror=True),
+)
+_RIGID_SOURCE, _SOFT_SOURCE = Source(RIGID, {}, "magenta", "rigid"), Source(STIFF, {}, "black", r"soft, $\kappa = 400$")
+_RIGID_FREQUENCY_SOURCE = Source(RIGID_BY_FREQUENCY, {}, "magenta", "rigid")
+_SOFT_FREQUENCY_SOURCE = Source(BY_FREQUENCY[0.5], {"k": 560.0}, "black", "soft, $k = 560$ N/m")
 
 
 def _series(letter: str, d: float) -> View:
@@ -210,7 +214,7 @@ def _sweep_of_stiffness(letter: str, d: float) -> View:
     down = Source(SOFTENED, {"d": d}, "black", r"$\kappa$ falling")
     up = Source(STIFFENED, {"d": d}, "tab:blue", r"$\kappa$ rising")
     levels = (Source(RIGID, {"d": d}, "red"),) if d in PHASE_PLANES else ()
-    # The paper shows the way up at d = 0.2 alone.
+    # The paper shows the sweep with rising kappa only at d = 0.2.
     return View(letter, "speed", (up, down) if d == 0.2 else (down,), f"$d = {d}$", levels)
 
 
@@ -223,7 +227,10 @@ def _softening(letter: str, d: float, *kappas: float) -> View:
 
 
 def _at_frequency(letter: str, omega: float, title: str) -> View:
-    both = tuple(source._replace(where=source.where | {"omega": omega}) for source in (_HARD_W, _SOFT_W))
+    both = tuple(
+        source._replace(where=source.where | {"omega": omega})
+        for source in (_RIGID_FREQUENCY_SOURCE, _SOFT_FREQUENCY_SOURCE)
+    )
     return View(letter, "phase plane", both, title)
 
 
@@ -231,7 +238,7 @@ _FAST_ORBIT = Source(SOFTENED, {"d": 0.2, "kappa": 4.0}, COLOURS[-1], r"$\kappa 
 
 
 def _fast(r: float) -> tuple[Source, ...]:
-    """Make sources of the three stiffest membranes at the frequencies of Fig. 16(b)."""
+    """Return the sources of the three stiffest membranes at the frequencies of Fig. 16(b)."""
     stiff, medium, soft = _by_spring(r)[:3]
     return tuple(
         source._replace(where=source.where | {"omega": omega})
@@ -244,17 +251,17 @@ FIGURES: dict[int, PaperFigure] = {
         "Rigid walls over $d$, $r = 0.5$",
         ("aabb", "aabb", "cdef", "cDEF", "gghh", "gghh"),
         (
-            View("a", "speed", (_IMAGE, _FIRST), unstable=("RL", "RLL")),
-            View("b", "strobe", (_IMAGE, _FIRST)),
+            View("a", "speed", (_MIRROR_SOURCE, _SWEEP_SOURCE), unstable=("RL", "RLL")),
+            View("b", "strobe", (_MIRROR_SOURCE, _SWEEP_SOURCE)),
             View("c", "section", (Source(RIGID_SECTION, {"d": 0.12}, "black"),), "$d = 0.12$"),
-            *_planes("def", _FIRST),
-            *_planes("DEF", _IMAGE),
-            View("g", "energies", (_FIRST,)),
-            View("h", "phase", (_IMAGE, _FIRST)),
+            *_planes("def", _SWEEP_SOURCE),
+            *_planes("DEF", _MIRROR_SOURCE),
+            View("g", "energies", (_SWEEP_SOURCE,)),
+            View("h", "phase", (_MIRROR_SOURCE, _SWEEP_SOURCE)),
         ),
         "From both starts of the paper the sweep settles on the same image: purple is its mirror image. Red: "
         "unstable 1:1 and 1:2 orbits. " + _ENERGY,
-        marks=(0.12, *PHASE_PLANES),
+        reference_values=(0.12, *PHASE_PLANES),
     ),
     4: PaperFigure(
         "Rigid walls: time series in the frame of the ground, $r = 0.5$",
@@ -266,19 +273,19 @@ FIGURES: dict[int, PaperFigure] = {
         r"Soft walls of $\kappa = 400$ against rigid walls over $d$, $r = 0.5$",
         ("aabb", "aabb", "cdef", "gghh", "gghh", "iijj", "iijj"),
         (
-            *_each("ab", ("speed", "strobe"), (_HARD, _SOFT)),
+            *_panels_of_sources("ab", ("speed", "strobe"), (_RIGID_SOURCE, _SOFT_SOURCE)),
             View(
                 "c",
                 "section",
                 (Source(RIGID_SECTION, {"d": 0.12}, "magenta"), Source(STIFF_SECTION, {"d": 0.12}, "black")),
                 "$d = 0.12$",
             ),
-            *_planes("def", _HARD, _SOFT),
-            *_each("ghij", ("restitution", "duration", "energies", "phase"), (_SOFT,)),
+            *_planes("def", _RIGID_SOURCE, _SOFT_SOURCE),
+            *_panels_of_sources("ghij", ("restitution", "duration", "energies", "phase"), (_SOFT_SOURCE,)),
         ),
         "The rigid walls start as in Fig. 3 and may settle on mirror images; (d) to (f) show like ones. Red: an "
         "unstable 1:2 orbit. " + _ENERGY,
-        marks=(0.12, *PHASE_PLANES),
+        reference_values=(0.12, *PHASE_PLANES),
     ),
     6: PaperFigure(
         r"Soft walls over $\kappa = 400/n$, $r = 0.5$",
@@ -329,15 +336,17 @@ FIGURES: dict[int, PaperFigure] = {
         r"Soft against rigid walls over $\omega$: $\omega_0 = 400$ rad/s, $s = 0.2$ m, $r = 0.5$",
         ("aabb", "aabb", "cdef", "gghh", "gghh", "iijj", "iijj"),
         (
-            *_each("ab", ("speed in m/s", "strobe in m"), (_HARD_W, _SOFT_W)),
+            *_panels_of_sources(
+                "ab", ("speed in m/s", "strobe in m"), (_RIGID_FREQUENCY_SOURCE, _SOFT_FREQUENCY_SOURCE)
+            ),
             _at_frequency("c", np.pi / 3, r"$\omega = \pi/3$"),
             _at_frequency("d", np.pi, r"$\omega = \pi$"),
             View("e", "chaos", (Source(FREQUENCY_SECTION, {"omega": 7.79}, "black"),), r"$\omega = 7.79$"),
             _at_frequency("f", 10.99, r"$\omega = 10.99$"),
-            *_each("ghij", ("energies", "phase", "restitution", "duration"), (_SOFT_W,)),
+            *_panels_of_sources("ghij", ("energies", "phase", "restitution", "duration"), (_SOFT_FREQUENCY_SOURCE,)),
         ),
         r"$\omega$ rises from 0.5 to 15 rad/s by 0.03, as the caption names no range. " + _ENERGY,
-        marks=(np.pi / 3, np.pi, 7.79, 10.99),
+        reference_values=(np.pi / 3, np.pi, 7.79, 10.99),
     ),
     13: _at_frequencies(0.5),
     14: _at_frequencies(0.1),

@@ -1,7 +1,7 @@
 """The paper's claims recomputed: by its own procedure, then converged, from orbits, branches and many starts.
 
-Every figure of ours is computed when a claim is checked; the paper's are in its own words beside it. Mirror images
-count as one attractor throughout, as all claims are at gamma = 0.
+The check of a claim computes all values of vijax; the values of the paper are quoted. Mirror images count as one
+attractor in all checks, because all claims are at gamma = 0.
 """
 
 from collections.abc import Callable
@@ -26,21 +26,21 @@ from scripts.paper.captions import (
     STIFFNESSES,
     Run,
 )
+from vijax.continuation.branch_continuation import Branch
+from vijax.maps.chaos import survival
+from vijax.maps.orbit_diagram import orbit_diagram
 from vijax.model.device import Harvester
-from vijax.orbits.continuation import Branch
-from vijax.planes.chaos import survival
-from vijax.planes.orbit_diagram import orbit_diagram
 
 if TYPE_CHECKING:
     import xarray as xr
 
 MICRO = 1e6
-FAST = 2.0  # largest speed of starts in the wide gaps of high frequencies
-SLOW_IMPACT = 0.25  # |u'| below which an impact counts as slow: rigid 1:n orbits have none near it
+FAST = 2.0  # largest speed of starts, for the wide gaps of high frequencies
+SLOW_IMPACT = 0.25  # |u'| below which an impact counts as slow: rigid 1:n orbits have no speeds near it
 
 
 class Finding(NamedTuple):
-    """Ours by the paper's procedure, ours converged, and what follows."""
+    """Result of a check: by the procedure of the paper, converged, and the verdict on the claim."""
 
     swept: str
     converged: str
@@ -48,11 +48,11 @@ class Finding(NamedTuple):
 
 
 class Claim(NamedTuple):
-    """A claim: a short name, the figure or table, what the paper says, its figure, and how to check it."""
+    """A claim: a short name, the figure or table, the statement and the value of the paper, and the check."""
 
     name: str
     where: str
-    says: str
+    statement: str
     paper: str
     check: Callable[[], Finding]
 
@@ -60,33 +60,35 @@ class Claim(NamedTuple):
 CLAIMS: dict[str, Claim] = {}
 
 
-def _claim(name: str, where: str, says: str, paper: str) -> Callable[[Callable[[], Finding]], Callable[[], Finding]]:
-    """Enter the decorated check under its name."""
+def _claim(
+    name: str, where: str, statement: str, paper: str
+) -> Callable[[Callable[[], Finding]], Callable[[], Finding]]:
+    """Return a decorator that registers a check as a claim."""
 
     def enter(check: Callable[[], Finding]) -> Callable[[], Finding]:
-        CLAIMS[name] = Claim(name, where, says, paper, check)
+        CLAIMS[name] = Claim(name, where, statement, paper, check)
         return check
 
     return enter
 
 
-def line(claim: Claim, found: Finding) -> str:
-    """Put a claim and what was found in words, for a terminal."""
+def line(claim: Claim, finding: Finding) -> str:
+    """Return the lines of a claim and its finding for the terminal."""
     return (
-        f"{claim.name} ({claim.where}): {claim.says}\n"
+        f"{claim.name} ({claim.where}): {claim.statement}\n"
         f"  paper      {claim.paper}\n"
-        f"  swept      {found.swept}\n"
-        f"  converged  {found.converged}\n"
-        f"  verdict    {found.verdict}"
+        f"  swept      {finding.swept}\n"
+        f"  converged  {finding.converged}\n"
+        f"  verdict    {finding.verdict}"
     )
 
 
 def markdown(rows: list[tuple[Claim, Finding]]) -> str:
-    """Lay the claims out in a table."""
+    """Return the claims and their findings as a table in Markdown."""
     heads = ("claim", "paper", "ours by the paper's procedure", "ours converged", "verdict")
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
-    for claim, found in rows:
-        cells = (f"{claim.where}: {claim.says}", claim.paper, *found)
+    for claim, finding in rows:
+        cells = (f"{claim.where}: {claim.statement}", claim.paper, *finding)
         lines.append("| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |")
     return "\n".join([_PREFACE, "", *lines, ""])
 
@@ -110,8 +112,11 @@ def _damping() -> Finding:
 @_claim("H1", "Fig. 3", "1:1 attracts for 0.3 > d > 0.186 as d falls", "0.186")
 def _one_to_one() -> Finding:
     _, last = evidence.stretch(evidence.labels(RIGID), "1:1", 0.25)
-    found = branches("RL", "d", BRANCHES_WITHIN, BRANCHES_FROM, None)
-    flip, breaking = evidence.met(found, "flip", 0.187), evidence.met(found, "pitchfork", 0.26)
+    branches_of_orbit = branches("RL", "d", BRANCHES_WITHIN, BRANCHES_FROM, None)
+    flip, breaking = (
+        evidence.nearest_event(branches_of_orbit, "flip", 0.187),
+        evidence.nearest_event(branches_of_orbit, "pitchfork", 0.26),
+    )
     return Finding(
         f"1:1 down to {last:.3f}",
         f"stable down to d = {flip:.7f} (flip), symmetric down to {breaking:.7f} (pitchfork)",
@@ -121,8 +126,11 @@ def _one_to_one() -> Finding:
 
 @_claim("H2", "Fig. 3", "the 1:1 orbit ends as its inner loop grazes the wall", "grazing at 0.186")
 def _mechanism() -> Finding:
-    found = branches("RL", "d", BRANCHES_WITHIN, BRANCHES_FROM, None)
-    flip, graze = evidence.met(found, "flip", 0.187), evidence.met(found, "grazing flight", 0.182)
+    branches_of_orbit = branches("RL", "d", BRANCHES_WITHIN, BRANCHES_FROM, None)
+    flip, graze = (
+        evidence.nearest_event(branches_of_orbit, "flip", 0.187),
+        evidence.nearest_event(branches_of_orbit, "grazing flight", 0.182),
+    )
     return Finding(
         "-",
         f"a multiplier is -1 at d = {flip:.7f}; followed on, unstable, the loop grazes at {graze:.7f}",
@@ -139,7 +147,7 @@ def _below_the_flip() -> Finding:
     alone = all(set(share) == {"2:4/2T"} for share in shares.values())
     return Finding(
         f"2:4/2T from {first:.3f} to {last:.3f}",
-        "; ".join(f"d = {d}: {evidence.told_shares(share)}" for d, share in shares.items()),
+        "; ".join(f"d = {d}: {evidence.describe_shares(share)}" for d, share in shares.items()),
         "reproduced" if alone else "reproduced, with others beside it",
     )
 
@@ -157,12 +165,15 @@ def _unstable_neighbour() -> Finding:
 @_claim("H5", "Fig. 3", "below 0.3 and above 0.186 1:1 alone is reported", "one attractor")
 def _missed_attractor() -> Finding:
     names = evidence.labels(RIGID)
-    found = branches("RLL", "d", BRANCHES_WITHIN, BRANCHES_FROM, None)
-    flip, fold = evidence.met(found, "flip", 0.187), evidence.met(found, "fold", 0.2)
+    branches_of_orbit = branches("RLL", "d", BRANCHES_WITHIN, BRANCHES_FROM, None)
+    flip, fold = (
+        evidence.nearest_event(branches_of_orbit, "flip", 0.187),
+        evidence.nearest_event(branches_of_orbit, "fold", 0.2),
+    )
     shares = evidence.shares(d=0.19, r=0.5, wall="rigid")
     return Finding(
         f"{names.sel(d=0.19, method='nearest').item()} at 0.19",
-        f"1:2 is stable for {flip:.7f} < d < {fold:.7f}; d = 0.19: {evidence.told_shares(shares)}",
+        f"1:2 is stable for {flip:.7f} < d < {fold:.7f}; d = 0.19: {evidence.describe_shares(shares)}",
         "a stable 1:2 orbit is missed: a sweep from above cannot see it" if len(shares) > 1 else "reproduced",
     )
 
@@ -174,7 +185,7 @@ def _two_to_three() -> Finding:
     shares = evidence.shares(d=0.16, r=0.5, wall="rigid")
     return Finding(
         f"2:3/2T from {first:.3f} to {last:.3f}",
-        f"d = 0.16: {evidence.told_shares(shares)}",
+        f"d = 0.16: {evidence.describe_shares(shares)}",
         "reproduced" if "2:3/2T" in shares else "not reproduced",
     )
 
@@ -187,17 +198,17 @@ def _end_of_two_to_three() -> Finding:
     merged = ", ".join(f"{100 * share:.2g} % of slow impacts on the rarer wall at {d}" for d, share in slow.items())
     return Finding(
         f"down to {last:.3f}",
-        f"Lyapunov exponents {', '.join(f'{each} at {d}' for d, each in exponents.items())}; {merged}",
+        f"Lyapunov exponents {', '.join(f'{exponent} at {d}' for d, exponent in exponents.items())}; {merged}",
         "in part: chaos sets in before; at 0.124 the two mirror attractors merge"
-        if slow[0.1245] == 0 < slow[0.124] and all(each.chaotic for each in exponents.values())
+        if slow[0.1245] == 0 < slow[0.124] and all(exponent.chaotic for exponent in exponents.values())
         else "not reproduced",
     )
 
 
 def _slow_sides(d: float) -> float:
-    """Count the share of slow impacts that lie on the wall with fewer of them, in a long run."""
-    found = orbit_diagram(along="d", values=np.array([d]), r=0.5, wall="rigid", periods=6000, recorded_periods=5000)
-    side = found["side"].where(abs(found["v_in"]) < SLOW_IMPACT)
+    """Return the share of slow impacts at the wall with fewer slow impacts, in a long run."""
+    dataset = orbit_diagram(along="d", values=np.array([d]), r=0.5, wall="rigid", periods=6000, recorded_periods=5000)
+    side = dataset["side"].where(abs(dataset["v_in"]) < SLOW_IMPACT)
     counts = [int((side == wall).sum()) for wall in (-1, 1)]
     return min(counts) / sum(counts)
 
@@ -208,20 +219,20 @@ def _chaos_below() -> Finding:
     exponents = {d: evidence.exponent(d=d, r=0.5, wall="rigid") for d in (0.12, 0.11, 0.1)}
     window = evidence.stretch(names, "2:2", 0.08)
     return Finding(
-        evidence.told(names),
-        ", ".join(f"exponent {each} at {d}" for d, each in exponents.items()),
+        evidence.describe_bands(names),
+        ", ".join(f"exponent {exponent} at {d}" for d, exponent in exponents.items()),
         f"reproduced down to a period-1 window from {window[0]:.3f} to {window[1]:.3f}"
-        if all(each.chaotic for each in exponents.values())
+        if all(exponent.chaotic for exponent in exponents.values())
         else "not reproduced",
     )
 
 
 @_claim("E1", "Fig. 3(g)", "a 1:1 impact gives 3 to 4 mJ, slow ones below 0.3 mJ", "3 to 4 mJ")
 def _energies() -> Finding:
-    names, found = evidence.labels(RIGID), diagram(RIGID)
-    single = found["E"].where(names == "1:1") * MICRO
-    slow = found["E"].where((names != "1:1") & (abs(found["v_in"]) < SLOW_IMPACT)) * MICRO
-    ball = 0.5 * Harvester().m_b * float((Harvester().speed_unit * abs(found["v_in"]).max()) ** 2) * MICRO
+    names, dataset = evidence.labels(RIGID), diagram(RIGID)
+    single = dataset["E"].where(names == "1:1") * MICRO
+    slow = dataset["E"].where((names != "1:1") & (abs(dataset["v_in"]) < SLOW_IMPACT)) * MICRO
+    ball = 0.5 * Harvester().m_b * float((Harvester().speed_unit * abs(dataset["v_in"]).max()) ** 2) * MICRO
     low, high = float(single.min()), float(single.max())
     return Finding(
         f"1:1 {low:.3g} to {high:.3g} microjoules, slow ones up to {float(slow.max()):.3g}",
@@ -233,8 +244,8 @@ def _energies() -> Finding:
 
 @_claim("E2", "Eq. (36)", "P equals E_j on 1:1 orbits with tau_P = 2pT", "P = E_j")
 def _mean_energy() -> Finding:
-    names, found = evidence.labels(RIGID), diagram(RIGID)
-    ratio = (found["P"] / found["E"].mean("impact")).where(names == "1:1")
+    names, dataset = evidence.labels(RIGID), diagram(RIGID)
+    ratio = (dataset["P"] / dataset["E"].mean("impact")).where(names == "1:1")
     return Finding(
         f"P over the mean E_j: {float(ratio.min()):.6g} to {float(ratio.max()):.6g}",
         "-",
@@ -264,30 +275,35 @@ def _agreement() -> Finding:
     same = int((soft.values == rigid.values).sum())
     rho = diagram(STIFF)["restitution"].where(soft != "aperiodic")
     power = abs(diagram(STIFF)["P"] / diagram(RIGID)["P"] - 1)
-    shares = {d: [evidence.shares(d=d, r=0.5, **told) for told in _WALLS] for d in (0.2, 0.18, 0.16)}
-    alike = all(evidence.commonest(hard) == evidence.commonest(stiff) for hard, stiff in shares.values())
+    shares = {
+        d: [evidence.shares(d=d, r=0.5, **wall_options) for wall_options in _WALL_OPTIONS] for d in (0.2, 0.18, 0.16)
+    }
+    agree = all(
+        evidence.commonest(rigid_shares) == evidence.commonest(soft_shares)
+        for rigid_shares, soft_shares in shares.values()
+    )
     return Finding(
         f"labels alike at {same} of {soft.size} d; rho {float(rho.min()):.3f} to {float(rho.max()):.3f} on periodic "
         f"attractors; P apart by {100 * float(power.median()):.2g} % (median)",
         "; ".join(
-            f"d = {d}: rigid {evidence.told_shares(hard)}, soft {evidence.told_shares(stiff)}"
-            for d, (hard, stiff) in shares.items()
+            f"d = {d}: rigid {evidence.describe_shares(rigid_shares)}, soft {evidence.describe_shares(soft_shares)}"
+            for d, (rigid_shares, soft_shares) in shares.items()
         ),
         f"reproduced: the commonest attractors of the phase planes agree; labels differ at {soft.size - same} d"
-        if alike
+        if agree
         else f"labels differ at {soft.size - same} d, those of the phase planes among them",
     )
 
 
-_WALLS = ({"wall": "rigid"}, {"kappa": 400.0})
+_WALL_OPTIONS = ({"wall": "rigid"}, {"kappa": 400.0})
 
 
 # --- Figs. 6 to 11: softer walls over kappa and d -------------------------------------------------
 
 
 def _peak(branches: list[Branch]) -> tuple[float, float]:
-    """Find kappa and value of the largest impact speed along branches, by the parabola through the highest points."""
-    best = max(branches, key=lambda each: float(np.nanmax(evidence.speeds(each.orbit))))
+    """Return kappa and value of the largest impact speed along branches, by a parabola through the highest points."""
+    best = max(branches, key=lambda branch: float(np.nanmax(evidence.speeds(branch.orbit))))
     top = np.nanmax(evidence.speeds(best.orbit), axis=1)
     i = int(np.clip(np.argmax(top), 1, top.size - 2))
     x, y = best.values[i - 1 : i + 2], top[i - 1 : i + 2]
@@ -305,9 +321,11 @@ def _rapid_fall() -> Finding:
     kappa = down["kappa"].values
     drop = int(np.argmax(-np.diff(down.values)))
     rise = int(np.argmax(np.diff(up.values[::-1])))
-    found = branches("RL", "kappa", (3.0, 12.0), 0.2, 4.5)
-    top, speed = _peak(found)
-    folds = sorted({round(point.value, 6) for each in found for point in each.points if point.kind == "fold"})
+    branches_of_orbit = branches("RL", "kappa", (3.0, 12.0), 0.2, 4.5)
+    top, speed = _peak(branches_of_orbit)
+    folds = sorted(
+        {round(point.value, 6) for branch in branches_of_orbit for point in branch.points if point.kind == "fold"}
+    )
     return Finding(
         f"fastest at {float(down.idxmax('kappa')):.4g}, jump down between {kappa[drop]:.4g} and {kappa[drop + 1]:.4g}, "
         f"up between {kappa[::-1][rise]:.4g} and {kappa[::-1][rise + 1]:.4g}",
@@ -323,7 +341,7 @@ def _coexistence() -> Finding:
     shares = evidence.shares(starts=4096, d=0.2, kappa=3.0, r=0.5)
     return Finding(
         f"the sweep ends on {evidence.labels(SOFTENED, d=0.2).values[-1]}",
-        evidence.told_shares(shares),
+        evidence.describe_shares(shares),
         "reproduced"
         if set(shares) == {"1:1", "2:2/3T"}
         else f"reproduced, but there are {len(shares)}: the commonest, {evidence.commonest(shares)}, is not mentioned",
@@ -331,14 +349,14 @@ def _coexistence() -> Finding:
 
 
 def _first_one_to_one(d: float, paper: float, other: float) -> Finding:
-    """Find where 1:2 gives way to 1:1 as kappa falls."""
+    """Return the finding on the transition from 1:2 to 1:1 as kappa falls."""
     names = evidence.labels(SOFTENED, d=d)
     first, _ = evidence.stretch(names, "1:1", 12.0)
     index = int(np.argmin(np.abs(names["kappa"].values - first)))
     before = float(names["kappa"][index - 1])
     rising, _ = evidence.stretch(evidence.labels(STIFFENED, d=d), "1:1", 12.0)
     shares = "; ".join(
-        f"{kappa:.4g}: {evidence.told_shares(evidence.shares(d=d, kappa=kappa, r=0.5))}" for kappa in (57.14, 28.57)
+        f"{kappa:.4g}: {evidence.describe_shares(evidence.shares(d=d, kappa=kappa, r=0.5))}" for kappa in (57.14, 28.57)
     )
     near = {paper: abs(np.log(first / paper)), other: abs(np.log(first / other))}
     return Finding(
@@ -376,8 +394,8 @@ def _chaos_to_one_to_two() -> Finding:
     first, _ = evidence.stretch(names, "1:2", 18.0)
     shares = {kappa: evidence.shares(d=0.12, kappa=kappa, r=0.5) for kappa in (400 / 11, 400 / 12, 400 / 19)}
     return Finding(
-        evidence.told(names.sel(kappa=slice(400, 14))),
-        "; ".join(f"{kappa:.4g}: {evidence.told_shares(share)}" for kappa, share in shares.items()),
+        evidence.describe_bands(names.sel(kappa=slice(400, 14))),
+        "; ".join(f"{kappa:.4g}: {evidence.describe_shares(share)}" for kappa, share in shares.items()),
         "reproduced"
         if first > 36
         else f"roughly: 2:4/2T from {evidence.values(names, '2:4/2T').max():.4g}, 1:2 itself from {first:.4g}",
@@ -388,11 +406,11 @@ def _chaos_to_one_to_two() -> Finding:
 def _one_to_one_at_012() -> Finding:
     first, _ = evidence.stretch(evidence.labels(SOFTENED, d=0.12), "1:1", 10.0)
     shares = evidence.shares(d=0.12, kappa=400 / 33, r=0.5)
-    found = branches("RL", "kappa", (3.0, 40.0), 0.12, 12.65)
-    breaking = evidence.met(found, "pitchfork", 10.8)
+    branches_of_orbit = branches("RL", "kappa", (3.0, 40.0), 0.12, 12.65)
+    breaking = evidence.nearest_event(branches_of_orbit, "pitchfork", 10.8)
     return Finding(
         f"from {first:.4g} on",
-        f"at 12.12 {evidence.told_shares(shares)}, symmetric from kappa = {breaking:.6g} down",
+        f"at 12.12 {evidence.describe_shares(shares)}, symmetric from kappa = {breaking:.6g} down",
         f"not reproduced: 1:1 comes at {first:.4g} already" if first > 400 / 32.5 else "reproduced",
     )
 
@@ -403,8 +421,8 @@ def _one_to_one_at_all_gaps() -> Finding:
     _, last = evidence.stretch(names, "1:1", 0.25)
     shares = {d: evidence.shares(d=d, kappa=12.65, r=0.5) for d in (0.12, last - 0.002, 0.08)}
     return Finding(
-        evidence.told(names),
-        "; ".join(f"d = {d:.3g}: {evidence.told_shares(share)}" for d, share in shares.items()),
+        evidence.describe_bands(names),
+        "; ".join(f"d = {d:.3g}: {evidence.describe_shares(share)}" for d, share in shares.items()),
         f"holds from d = {last:.3f} up only" if last > 0.05 else "reproduced",
     )
 
@@ -413,8 +431,8 @@ def _one_to_one_at_all_gaps() -> Finding:
 def _transient_chaos() -> Finding:
     names = evidence.labels(BY_GAP[0.5], kappa=4.0)
     chaotic = evidence.values(names, "aperiodic")
-    found = survival(d=0.25, kappa=4.0, r=0.5, starts=64, periods=40_000)
-    lifetime, error = float(found.lifetime), float(found.lifetime_stderr)
+    survival_data = survival(d=0.25, kappa=4.0, r=0.5, starts=64, periods=40_000)
+    lifetime, error = float(survival_data.lifetime), float(survival_data.lifetime_stderr)
     return Finding(
         f"aperiodic from d = {chaotic.max():.3f} to {chaotic.min():.3f}; at 0.25 its exponent is "
         f"{evidence.exponent(d=0.25, kappa=4.0, r=0.5, transient=200, periods=400)} over 400 periods",
@@ -445,7 +463,7 @@ def _sporadic() -> Finding:
     shares = {d: evidence.shares(d=d, kappa=4.0, r=0.1) for d in (0.3, 0.25)}
     return Finding(
         f"impacts in the 25 kept periods: {counts}",
-        "; ".join(f"d = {d}: {evidence.told_shares(share)}" for d, share in shares.items()),
+        "; ".join(f"d = {d}: {evidence.describe_shares(share)}" for d, share in shares.items()),
         "reproduced: slow drifts between ever rarer impacts, which never quite settle"
         if all(int(point.filled) < 25 for point in few.values())
         else "not reproduced",
@@ -459,7 +477,7 @@ def _elastic() -> Finding:
     point = evidence.part(BY_GAP[0.95], kappa=12.65, d=0.16)
     speeds = abs(point["v_in"])
     names = [evidence.labels(BY_GAP[0.95], kappa=12.65, d=d).item() for d in (0.16, 0.12)]
-    breaking = evidence.met(branches("RL", "kappa", (8.0, 40.0), 0.16, 12.65, 0.95), "pitchfork", 12.0)
+    breaking = evidence.nearest_event(branches("RL", "kappa", (8.0, 40.0), 0.16, 12.65, 0.95), "pitchfork", 12.0)
     exponent = evidence.exponent(d=0.12, kappa=12.65, r=0.95)
     return Finding(
         f"0.16: {names[0]}, speeds apart by {float(speeds.max() - speeds.min()):.4f}; 0.12: {names[1]}",
@@ -474,7 +492,7 @@ def _all_symmetric() -> Finding:
     shares = {kappa: evidence.shares(d=0.16, kappa=kappa, r=0.1) for kappa in STIFFNESSES[:2]}
     return Finding(
         ", ".join(f"{name} at {kappa:g}" for kappa, name in zip(STIFFNESSES, names, strict=True)),
-        "; ".join(f"{kappa:g}: {evidence.told_shares(share)}" for kappa, share in shares.items()),
+        "; ".join(f"{kappa:g}: {evidence.describe_shares(share)}" for kappa, share in shares.items()),
         "reproduced" if set(names) == {"1:1"} else "not at the stiffest, where slow impacts follow the fast ones",
     )
 
@@ -483,32 +501,36 @@ def _all_symmetric() -> Finding:
 
 
 def _both_walls(name: str, at: float, end: int) -> tuple[float, float]:
-    """Find first (0) or last (1) omega of the stretch of a name around a value, soft and rigid."""
+    """Return the first (end 0) or last (end 1) omega of a label's stretch around a value, for soft and rigid walls."""
     soft, rigid = evidence.labels(BY_FREQUENCY[0.5], k=560.0), evidence.labels(RIGID_BY_FREQUENCY)
     return evidence.stretch(soft, name, at)[end], evidence.stretch(rigid, name, at)[end]
 
 
-def _fork(walls: str, kind: str, near: float, at: float, within: tuple[float, float], period: int = 1) -> list[float]:
-    """Find a point along omega, soft and rigid; rigid walls have it where their d is that of the frequency."""
-    soft = evidence.met(branches(walls, "omega", within, *evidence.at_frequency(at, 560.0), 0.5, period), kind, near)
+def _event_frequencies(
+    walls: str, kind: str, near: float, at: float, within: tuple[float, float], period: int = 1
+) -> list[float]:
+    """Return omega of an event for soft and rigid walls; rigid branches are along d, which specifies omega."""
+    soft = evidence.nearest_event(
+        branches(walls, "omega", within, *evidence.at_frequency(at, 560.0), 0.5, period), kind, near
+    )
     gap, rigid_gap = (evidence.at_frequency(omega, None)[0] for omega in (at, near))
     bounds = tuple(evidence.at_frequency(omega, None)[0] for omega in within)
     span, start = (BRANCHES_WITHIN, BRANCHES_FROM) if period == 1 else (bounds, gap)
-    d = evidence.met(branches(walls, "d", span, start, None, 0.5, period), kind, rigid_gap)
+    d = evidence.nearest_event(branches(walls, "d", span, start, None, 0.5, period), kind, rigid_gap)
     return [soft, float(np.pi * np.sqrt(d * Harvester().A / GAP_IN_METRES))]
 
 
-def _told_fork(kind: str, found: list[float]) -> str:
-    return f"{kind} at omega = {found[0]:.4f} soft, {found[1]:.4f} rigid"
+def _describe_event(kind: str, frequencies: list[float]) -> str:
+    return f"{kind} at omega = {frequencies[0]:.4f} soft, {frequencies[1]:.4f} rigid"
 
 
 @_claim("F12a", "Fig. 12", "1:1 emerges at omega = 3.12", "3.12")
 def _emergence() -> Finding:
     soft, rigid = _both_walls("1:1", 5.0, 0)
-    found = _fork("RLL", "fold", 3.14, 3.1, (2.9, 3.4))
+    frequencies = _event_frequencies("RLL", "fold", 3.14, 3.1, (2.9, 3.4))
     return Finding(
         f"from {soft:.4g} soft, {rigid:.4g} rigid",
-        f"1:2 ends: {_told_fork('fold', found)}",
+        f"1:2 ends: {_describe_event('fold', frequencies)}",
         "reproduced to the step of the sweep" if abs(soft - 3.12) < 0.03 else "not reproduced",
     )
 
@@ -516,10 +538,10 @@ def _emergence() -> Finding:
 @_claim("F12b", "Fig. 12", "chaos from omega = 6.89", "6.89")
 def _end_of_one_to_one() -> Finding:
     soft, rigid = _both_walls("1:1", 5.0, 1)
-    found = _fork("RL", "fold", 6.9, 5.0, (3.0, 8.0))
+    frequencies = _event_frequencies("RL", "fold", 6.9, 5.0, (3.0, 8.0))
     return Finding(
         f"1:1 up to {soft:.4g} soft, {rigid:.4g} rigid",
-        f"1:1 ends: {_told_fork('fold', found)}",
+        f"1:1 ends: {_describe_event('fold', frequencies)}",
         "reproduced to the step of the sweep" if abs(soft + 0.03 - 6.89) < 0.031 else "not reproduced",
     )
 
@@ -527,32 +549,32 @@ def _end_of_one_to_one() -> Finding:
 @_claim("F12c", "Fig. 12", "chaos up to omega = 9.97, then 3T", "9.97")
 def _emergence_of_three() -> Finding:
     soft, rigid = _both_walls("1:1/3T", 11.0, 0)
-    found = _fork("RL", "flip", 10.3, 10.4, (9.5, 12.5), 3)
+    frequencies = _event_frequencies("RL", "flip", 10.3, 10.4, (9.5, 12.5), 3)
     return Finding(
         f"1:1/3T from {soft:.4g} soft, {rigid:.4g} rigid",
-        f"stable from: {_told_fork('flip', found)}",
+        f"stable from: {_describe_event('flip', frequencies)}",
         "reproduced"
         if abs(soft - 9.97) < 0.03
-        else f"shifted by {soft - 9.97:+.2f}, as {found[0] - 9.97:+.2f} converged",
+        else f"shifted by {soft - 9.97:+.2f}, as {frequencies[0] - 9.97:+.2f} converged",
     )
 
 
 @_claim("F12d", "Fig. 12", "chaos again from omega = 11.93", "11.93")
 def _end_of_three() -> Finding:
     soft, rigid = _both_walls("1:1/3T", 11.0, 1)
-    found = _fork("RL", "fold", 11.85, 11.0, (9.5, 12.5), 3)
+    frequencies = _event_frequencies("RL", "fold", 11.85, 11.0, (9.5, 12.5), 3)
     return Finding(
         f"1:1/3T up to {soft:.4g} soft, {rigid:.4g} rigid",
-        f"3T ends: {_told_fork('fold', found)}",
-        "reproduced within 0.1" if abs(found[0] - 11.93) < 0.1 else "not reproduced",
+        f"3T ends: {_describe_event('fold', frequencies)}",
+        "reproduced within 0.1" if abs(frequencies[0] - 11.93) < 0.1 else "not reproduced",
     )
 
 
 @_claim("F12e", "Fig. 12", "multi-impact T at pi/3, 1:1 at pi, 3T at 10.99, chaos at 7.79", "as said")
 def _four_frequencies() -> Finding:
     soft, rigid = evidence.labels(BY_FREQUENCY[0.5], k=560.0), evidence.labels(RIGID_BY_FREQUENCY)
-    shown = (np.pi / 3, np.pi, 10.99, 7.79)
-    names = [[labels.sel(omega=omega, method="nearest").item() for omega in shown] for labels in (soft, rigid)]
+    frequencies = (np.pi / 3, np.pi, 10.99, 7.79)
+    names = [[labels.sel(omega=omega, method="nearest").item() for omega in frequencies] for labels in (soft, rigid)]
     shares = {
         omega: evidence.shares(speed=FAST, s=GAP_IN_METRES, omega=omega, k=560.0, r=0.5) for omega in (np.pi, 10.99)
     }
@@ -560,7 +582,7 @@ def _four_frequencies() -> Finding:
     reproduced = names[0][1:] == ["1:1", "1:1/3T", "aperiodic"]
     return Finding(
         f"soft {', '.join(names[0])}; rigid {', '.join(names[1])}",
-        "; ".join(f"soft at {omega:.4g}: {evidence.told_shares(share)}" for omega, share in shares.items())
+        "; ".join(f"soft at {omega:.4g}: {evidence.describe_shares(share)}" for omega, share in shares.items())
         + f"; exponent {exponent} at 7.79",
         "reproduced by soft walls" + ("" if names[1][1] == "1:1" else "; rigid ones are still 1:2 at pi")
         if reproduced
@@ -570,7 +592,7 @@ def _four_frequencies() -> Finding:
 
 @_claim("F13a", "Figs. 13-15(b)", "rho passes 1 in slow impacts of chaos, at r = 0.95 too", "rho > 1")
 def _more_than_elastic() -> Finding:
-    said, shares = [], []
+    descriptions, shares = [], []
     for r in (0.5, 0.95):
         for k in (0.56, 0.056):
             names, part = evidence.labels(BY_FREQUENCY[r], k=k), evidence.part(BY_FREQUENCY[r], k=k)
@@ -578,20 +600,20 @@ def _more_than_elastic() -> Finding:
             fast = abs(part["v_in"]).where(rho > 1)
             share = float((rho > 1).sum() / rho.notnull().sum())
             shares.append(share)
-            said.append(f"r = {r}, k = {k}: {100 * share:.2g} % of impacts, |u'| up to {float(fast.max()):.2g}")
-    return Finding("; ".join(said), "-", "reproduced" if min(shares) > 0 else "not reproduced")
+            descriptions.append(f"r = {r}, k = {k}: {100 * share:.2g} % of impacts, |u'| up to {float(fast.max()):.2g}")
+    return Finding("; ".join(descriptions), "-", "reproduced" if min(shares) > 0 else "not reproduced")
 
 
 @_claim("F13b", "Figs. 13-15(e, f)", "energy grows as k falls, down to k = 0.56", "E and P grow")
-def _softer_gives_more() -> Finding:
-    said, rises = [], []
+def _energy_of_soft_membranes() -> Finding:
+    descriptions, rises = [], []
     for r in (0.5, 0.1, 0.95):
         power = evidence.part(BY_FREQUENCY[r], omega=np.pi)["P"].values * MICRO
         rises.append(bool((np.diff(power[:4]) > 0).all()))
-        said.append(f"r = {r}: {', '.join(f'{x:.3g}' for x in power)}")
+        descriptions.append(f"r = {r}: {', '.join(f'{x:.3g}' for x in power)}")
     shares = [_admissible(k) for k in SPRINGS]
     return Finding(
-        f"P in microjoules at omega = pi, k = 560 ... 0.056: {'; '.join(said)}",
+        f"P in microjoules at omega = pi, k = 560 ... 0.056: {'; '.join(descriptions)}",
         "part of omega in 3.2 ... 6 where Eq. (34) gives no more than the membrane got (r = 0.5): "
         + ", ".join(f"{100 * share:.0f} % at k = {k:g}" for k, share in zip(SPRINGS, shares, strict=True)),
         "reproduced as the formula goes, but it gives out more than was put in on soft membranes"
@@ -601,26 +623,28 @@ def _softer_gives_more() -> Finding:
 
 
 def _admissible(k: float) -> float:
-    """Count the share of frequencies in the 1:1 zone at which the energies are admissible."""
-    from vijax.planes.sweep import sweep
+    """Return the share of frequencies in the 1:1 zone with admissible energies."""
+    from vijax.maps.sweep import sweep
 
-    found = sweep(s=GAP_IN_METRES, omega=np.linspace(3.2, 6.0, 29), k=k, r=0.5, outputs=("admissible",))
-    return float(found["admissible"].mean())
+    dataset = sweep(s=GAP_IN_METRES, omega=np.linspace(3.2, 6.0, 29), k=k, r=0.5, outputs=("admissible",))
+    return float(dataset["admissible"].mean())
 
 
 @_claim("F13c", "Figs. 13, 14", "k = 0.056: sporadic or no impacts at larger omega", "few impacts")
-def _silence() -> Finding:
-    said, quiets = [], []
+def _rare_impacts() -> Finding:
+    descriptions, shares_without_impacts = [], []
     for r in (0.5, 0.1):
         part = evidence.part(BY_FREQUENCY[r], k=0.056)
-        quiet = float((part["filled"].sel(omega=slice(6, 15)) == 0).mean())
-        quiets.append(quiet)
-        said.append(f"r = {r}: no impact in the kept periods at {100 * quiet:.0f} % of omega above 6")
+        share_without_impacts = float((part["filled"].sel(omega=slice(6, 15)) == 0).mean())
+        shares_without_impacts.append(share_without_impacts)
+        descriptions.append(
+            f"r = {r}: no impact in the kept periods at {100 * share_without_impacts:.0f} % of omega above 6"
+        )
     shares = evidence.shares(s=GAP_IN_METRES, omega=8.0, k=0.056, r=0.5)
     return Finding(
-        "; ".join(said),
-        f"omega = 8, r = 0.5: {evidence.told_shares(shares)}",
-        "reproduced" if min(quiets) > 0.5 else "in part",
+        "; ".join(descriptions),
+        f"omega = 8, r = 0.5: {evidence.describe_shares(shares)}",
+        "reproduced" if min(shares_without_impacts) > 0.5 else "in part",
     )
 
 
@@ -634,7 +658,8 @@ def _many_impacts() -> Finding:
     return Finding(
         f"over two impacts in period 1 at {int(many.sum())} of {along.size} omega; stretches: {', '.join(stretch)}",
         "; ".join(
-            f"omega = {omega:g}: {evidence.told_shares(evidence.shares(s=GAP_IN_METRES, omega=omega, k=5.6, r=0.1))}"
+            f"omega = {omega:g}: "
+            f"{evidence.describe_shares(evidence.shares(s=GAP_IN_METRES, omega=omega, k=5.6, r=0.1))}"
             for omega in (2.0, 4.0, 8.0)
         ),
         "reproduced" if bool(many.all()) else f"only up to omega = {along[many.values].max(initial=0):.3g}",
@@ -645,17 +670,19 @@ def _many_impacts() -> Finding:
 def _three_periods() -> Finding:
     cases = ((560.0, 10.0), (56.0, 10.0), (5.6, 10.5))
     swept = [evidence.labels(BY_FREQUENCY[0.5], k=k, omega=omega).item() for k, omega in cases]
-    found = []
+    descriptions = []
     for k, omega in cases:
-        three = orbits("RL", *evidence.at_frequency(omega, k), 0.5, 3)
-        growth = f"{evidence.growth(three).min():.3f}" if len(three) else "none"
+        orbits_of_three_periods = orbits("RL", *evidence.at_frequency(omega, k), 0.5, 3)
+        growth = f"{evidence.growth(orbits_of_three_periods).min():.3f}" if len(orbits_of_three_periods) else "none"
         shares = evidence.shares(speed=FAST, s=GAP_IN_METRES, omega=omega, k=k, r=0.5)
-        found.append(f"k = {k:g}: least largest multiplier {growth}; {evidence.told_shares(shares)}")
-    good = [k for (k, _), name in zip(cases, swept, strict=True) if name == "1:1/3T"]
+        descriptions.append(f"k = {k:g}: least largest multiplier {growth}; {evidence.describe_shares(shares)}")
+    confirmed = [k for (k, _), name in zip(cases, swept, strict=True) if name == "1:1/3T"]
     return Finding(
         ", ".join(f"{name} at k = {k:g}" for (k, _), name in zip(cases, swept, strict=True)),
-        "; ".join(found),
-        "reproduced" if len(good) == len(cases) else f"at k = {', '.join(f'{k:g}' for k in good) or 'none'} only",
+        "; ".join(descriptions),
+        "reproduced"
+        if len(confirmed) == len(cases)
+        else f"at k = {', '.join(f'{k:g}' for k in confirmed) or 'none'} only",
     )
 
 
@@ -665,14 +692,14 @@ def _three_periods() -> Finding:
 def _second_breaking() -> Finding:
     names, part = evidence.labels(BY_GAP[0.5], kappa=12.65), evidence.part(BY_GAP[0.5], kappa=12.65)
     left, right = (part["restitution"].where(part["side"] == side).mean("impact") for side in (-1, 1))
-    apart = (abs(left - right) > 1e-6) & (names == "1:1")
+    differs = (abs(left - right) > 1e-6) & (names == "1:1")
     stable = evidence.stable(orbits("RL", 0.12, 12.65, 0.5))
-    breaking = evidence.met(branches("RL", "kappa", (3.0, 40.0), 0.12, 12.65), "pitchfork", 10.9)
-    at = part.sel(d=0.12, method="nearest")
-    rho = [float(at["restitution"].where(at["side"] == side).mean()) for side in (-1, 1)]
+    breaking = evidence.nearest_event(branches("RL", "kappa", (3.0, 40.0), 0.12, 12.65), "pitchfork", 10.9)
+    point = part.sel(d=0.12, method="nearest")
+    rho = [float(point["restitution"].where(point["side"] == side).mean()) for side in (-1, 1)]
     return Finding(
-        f"kappa = 12.65: rho differs left and right on 1:1 for d up to {float(apart['d'].where(apart).max()):.3f}; at "
-        f"0.12 {rho[0]:.4f} and {rho[1]:.4f}",
+        f"kappa = 12.65: rho differs left and right on 1:1 for d up to {float(differs['d'].where(differs).max()):.3f}; "
+        f"at 0.12 {rho[0]:.4f} and {rho[1]:.4f}",
         f"d = 0.12: the 1:1 branch has a pitchfork at kappa = {breaking:.6g}, where speeds part as well (by "
         f"{np.ptp(evidence.speeds(stable)[0]):.4f} at 12.65)",
         "rho parts indeed, at the one pitchfork where speeds part: a symmetric orbit has equal rho"

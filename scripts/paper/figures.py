@@ -1,4 +1,4 @@
-"""The paper's figures computed and drawn: runs -> orbit diagrams -> panels -> a picture."""
+"""Computation and drawing of the paper's figures: runs -> orbit diagrams -> panels -> a picture."""
 
 from collections.abc import Callable, Iterator
 from functools import lru_cache
@@ -13,21 +13,21 @@ from scripts.paper.portrait import Layer, Panel, phase_plane, small_multiples, t
 from vijax.model.pair import ImpactPair, impact_pair
 from vijax.model.quantities import AXES
 from vijax.orbits.motion import Curve, curve, states
-from vijax.orbits.orbit_properties import path
+from vijax.orbits.orbit_properties import orbit_path
 
 if TYPE_CHECKING:
     import xarray as xr
 
 MICRO = 1e6
-SERIES_PERIODS = 4  # of a time series
-CHAOS_PERIODS = 100  # of the gray orbit behind a Poincare section
+SERIES_PERIODS = 4  # periods of a time series
+CHAOS_PERIODS = 100  # periods of the gray orbit behind a Poincare section
 
 
 class Quantity(NamedTuple):
-    """What a panel of an orbit diagram shows: a variable, its label, a factor, powers of the units it is given in.
+    """Quantity of a panel of an orbit diagram: variable, label, factor, and powers of the units of length and time.
 
-    The units of length and time are A pi^2/omega^2 [m] and pi/omega [s]; where both powers are 0, nothing is converted.
-    A panel ends at `top`, if that is given.
+    The units of length and time are A pi^2/omega^2 [m] and pi/omega [s]; with both powers 0 no unit is converted.
+    `top` is the upper limit of the panel; None for no limit.
     """
 
     variable: str
@@ -54,49 +54,49 @@ _LOGARITHMIC = {"energy", "power"}
 
 
 def axis_label(name: str) -> str:
-    """Write symbol and unit of the axis that a figure sweeps, as the paper writes them."""
+    """Return symbol and unit of a swept axis in the notation of the paper."""
     axis = AXES[name]
     return f"${axis.attributes['symbol']}$" + (f" [{axis.unit}]" if axis.unit else "")
 
 
 def selected(source: Source) -> "xr.Dataset":
-    """Pick the part of a diagram that a source names; the points nearest to its values."""
-    found = _mirrored(source.run) if source.mirror else diagram(source.run)
-    return found.sel({name: value for name, value in source.where.items() if name in found.dims}, method="nearest")
+    """Return the part of a diagram that a source selects: the points nearest to its values."""
+    dataset = _mirrored(source.run) if source.mirror else diagram(source.run)
+    return dataset.sel({name: value for name, value in source.where.items() if name in dataset.dims}, method="nearest")
 
 
 @lru_cache(maxsize=2)
 def _mirrored(run: Run) -> "xr.Dataset":
-    """Mirror a diagram along one axis, (u, t) -> (-u, t + 1): its strobes are half a period away."""
-    found = diagram(run)
-    later = np.floor(found["phase"])  # of two half periods, the second becomes the first of the next period
-    image = {name: -found[name] for name in ("v_in", "v_out", "side")}
-    image |= {"phase": found["phase"] + 1 - 2 * later, "period_number": found["period_number"] + later}
+    """Return the mirror image (u, t) -> (-u, t + 1) of a diagram; its strobes lie half a period later."""
+    dataset = diagram(run)
+    later = np.floor(dataset["phase"])  # the second half of a period becomes the first half of the next period
+    image = {name: -dataset[name] for name in ("v_in", "v_out", "side")}
+    image |= {"phase": dataset["phase"] + 1 - 2 * later, "period_number": dataset["period_number"] + later}
     halfway = 2.0 * np.arange(1, run.recorded_periods + 1) - 1.0
-    strobes = [states(pair_of(point, run.wall), *_impacts(point), when=halfway) for point in _points_of(found, run)]
+    strobes = [states(pair_of(point, run.wall), *_impacts(point), when=halfway) for point in _points_of(dataset, run)]
     u, v = (np.stack(rows) for rows in zip(*strobes, strict=True))
-    dims = found["u_strobe"].dims
-    return found.assign(image).assign(u_strobe=(dims, -u), v_strobe=(dims, -v))
+    dims = dataset["u_strobe"].dims
+    return dataset.assign(image).assign(u_strobe=(dims, -u), v_strobe=(dims, -v))
 
 
-def _points_of(found: "xr.Dataset", run: Run) -> Iterator["xr.Dataset"]:
-    return (found.isel({run.along: i}) for i in range(len(run.values)))
+def _points_of(dataset: "xr.Dataset", run: Run) -> Iterator["xr.Dataset"]:
+    return (dataset.isel({run.along: i}) for i in range(len(run.values)))
 
 
 def _impacts(point: "xr.Dataset") -> tuple[np.ndarray, ...]:
-    """List times on one clock, walls, velocities and contact times of the impacts of a single point."""
+    """Return onset times, walls, velocities and contact durations of the impacts of a single point."""
     t = (point["phase"] + 2.0 * point["period_number"]).where(point["v_in"].notnull())
     return t.values, *(point[name].values for name in ("side", "v_in", "v_out", "duration"))
 
 
 def pair_of(point: "xr.Dataset", wall: str) -> ImpactPair:
-    """Make the cell of a single point of a diagram."""
+    """Return the impact pair of a single point of a diagram."""
     d, kappa, r, gamma = (float(point[name]) for name in ("d", "kappa", "r", "gamma"))
     return impact_pair(d, None if wall == "rigid" else kappa, r, gamma)
 
 
 def motion(source: Source, periods: int | None = None) -> Curve:
-    """Draw the dense curve through the kept impacts of a single point; of its first `periods` if given."""
+    """Return the dense curve through the recorded impacts of a single point, or of its first `periods`."""
     point = selected(source)
     t, *rest = _impacts(point)
     if periods is not None:
@@ -105,7 +105,7 @@ def motion(source: Source, periods: int | None = None) -> Curve:
 
 
 def panels(number: int) -> dict[str, Panel]:
-    """Make every panel of a figure, by letter."""
+    """Return the panels of a figure by letter."""
     figure = FIGURES[number]
     return {view.letter: _SHOWS.get(view.shows, _sweep)(figure, view) for view in figure.views}
 
@@ -115,7 +115,7 @@ def draw(number: int, file: str | Path | None = None) -> Any:
 
     Args:
         number: 3 to 16.
-        file: Where to write it, if anywhere.
+        file: Path of the picture; None writes no file.
 
     Returns:
         The `matplotlib.figure.Figure`.
@@ -129,14 +129,14 @@ def draw(number: int, file: str | Path | None = None) -> Any:
 
 
 def _sweep(figure: PaperFigure, view: View) -> Panel:
-    """Lay a quantity over the swept axis."""
+    """Return the panel of a quantity over the swept axis."""
     if view.shows == "energies":
-        shown = [(source, name) for source in view.sources for name in ("energy", "power")]
+        drawn_quantities = [(source, name) for source in view.sources for name in ("energy", "power")]
     else:
-        shown = [(source, view.shows) for source in view.sources]
-    layers = [_points(source, name) for source, name in shown]
+        drawn_quantities = [(source, view.shows) for source in view.sources]
+    layers = [_points(source, name) for source, name in drawn_quantities]
     layers += _unstable_branches(view)
-    run, quantity = view.sources[0].run, QUANTITIES[shown[0][1]]
+    run, quantity = view.sources[0].run, QUANTITIES[drawn_quantities[0][1]]
     label, level = quantity.label, [(np.pi, "tab:blue")] if view.shows == "phase" else []
     for source in view.levels:
         front = view.sources[-1]
@@ -151,7 +151,7 @@ def _sweep(figure: PaperFigure, view: View) -> Panel:
         axis_label(run.along),
         label,
         layers,
-        upright=figure.marks if view.shows.startswith("speed") else (),
+        upright=figure.reference_values if view.shows.startswith("speed") else (),
         level=level,
         log=("x" if run.along == "kappa" else "") + ("y" if view.shows in _LOGARITHMIC else ""),
         top=quantity.top
@@ -161,13 +161,13 @@ def _sweep(figure: PaperFigure, view: View) -> Panel:
 
 
 def _points(source: Source, shows: str) -> Layer:
-    """Lay every value of a quantity over the swept axis."""
-    quantity, found = QUANTITIES[shows], selected(source)
-    length = found["A"] * np.pi**2 / found["omega"] ** 2
-    time = np.pi / found["omega"]
-    values = found[quantity.variable] * quantity.factor * length**quantity.length * time**quantity.time
+    """Return the layer of all values of a quantity over the swept axis."""
+    quantity, dataset = QUANTITIES[shows], selected(source)
+    length = dataset["A"] * np.pi**2 / dataset["omega"] ** 2
+    time = np.pi / dataset["omega"]
+    values = dataset[quantity.variable] * quantity.factor * length**quantity.length * time**quantity.time
     values = values.where(values > 0) if shows in _LOGARITHMIC else values
-    x, y = np.broadcast_arrays(found[source.run.along], values.transpose(..., source.run.along))
+    x, y = np.broadcast_arrays(dataset[source.run.along], values.transpose(..., source.run.along))
     return Layer(x, y, source.colour, "dots", source.text)
 
 
@@ -175,7 +175,7 @@ def _phase_plane(figure: PaperFigure, view: View) -> Panel:
     layers, front = [], motion(view.sources[-1])
     for source in view.sources:
         line = motion(source)
-        # Of attractors that are mirror images of each other, soft and rigid walls may settle on either.
+        # Soft and rigid walls may settle on different members of a pair of mirror images.
         image = _image(line, front) if source.run.wall == "rigid" else 1
         layers.append(Layer(image * line.u, image * line.v, source.colour, "line", source.text))
     for line in _unstable_orbits(view):
@@ -186,33 +186,35 @@ def _phase_plane(figure: PaperFigure, view: View) -> Panel:
 
 
 def _unstable_branches(view: View) -> list[Layer]:
-    """Lay out impact velocities of unstable orbits between rigid walls over d, and of their mirror images."""
+    """Return layers of impact velocities over d of unstable orbits between rigid walls and of their mirror images."""
     layers = []
     for walls in view.unstable:
-        for each in branches(walls, "d", BRANCHES_WITHIN, BRANCHES_FROM, None):
-            shown = ~each.stable & (each.values < max(view.sources[-1].run.values))
-            speeds = np.asarray(each.orbit.sequence.side * each.orbit.knots[..., 1])[shown]
-            x = np.broadcast_to(each.values[shown, None], speeds.shape)
+        for branch in branches(walls, "d", BRANCHES_WITHIN, BRANCHES_FROM, None):
+            is_drawn = ~branch.stable & (branch.values < max(view.sources[-1].run.values))
+            speeds = np.asarray(branch.orbit.sequence.side * branch.orbit.impact_unknowns[..., 1])[is_drawn]
+            x = np.broadcast_to(branch.values[is_drawn, None], speeds.shape)
             layers += [Layer(x, sign * speeds, "red", "dots", "unstable") for sign in (1, -1)]
     return layers
 
 
 def _unstable_orbits(view: View) -> Iterator[Curve]:
-    """Find unstable orbits at the parameters of the last source."""
+    """Yield the curves of unstable orbits at the parameters of the last source."""
     source = view.sources[-1]
     pair = pair_of(selected(source), source.run.wall)
     for walls in view.unstable:
-        found = orbits(walls, float(pair.d), None if pair.kappa is None else float(pair.kappa), float(pair.r))
-        wild = np.flatnonzero(np.abs(np.asarray(found.multipliers)).max(axis=1) > 1)
-        for instants in zip(*path(found[wild]), strict=True):
-            there = np.isfinite(instants[0])
-            yield Curve(*(x[there] for x in instants))
+        orbits_of_sequence = orbits(
+            walls, float(pair.d), None if pair.kappa is None else float(pair.kappa), float(pair.r)
+        )
+        unstable = np.flatnonzero(np.abs(np.asarray(orbits_of_sequence.multipliers)).max(axis=1) > 1)
+        for instants in zip(*orbit_path(orbits_of_sequence[unstable]), strict=True):
+            is_finite = np.isfinite(instants[0])
+            yield Curve(*(x[is_finite] for x in instants))
 
 
 def _image(line: Curve, other: Curve) -> int:
-    """Give -1 where two motions lean to opposite sides, so that the mirror image of one is like the other."""
-    lean, reference = (np.trapezoid(each.u, each.t) for each in (line, other))
-    return -1 if lean * reference < 0 else 1
+    """Return -1 if one motion resembles the mirror image of the other (mean u of opposite sign); 1 otherwise."""
+    integral, other_integral = (np.trapezoid(motion_curve.u, motion_curve.t) for motion_curve in (line, other))
+    return -1 if integral * other_integral < 0 else 1
 
 
 def _section(figure: PaperFigure, view: View) -> Panel:
@@ -222,7 +224,7 @@ def _section(figure: PaperFigure, view: View) -> Panel:
 
 
 def _chaos(figure: PaperFigure, view: View) -> Panel:
-    """Lay the orbit in gray under its Poincare section."""
+    """Return the panel of a Poincare section over the gray orbit."""
     (source,) = view.sources
     line, section = motion(source, CHAOS_PERIODS), _section(figure, view)
     return section._replace(layers=[Layer(line.u, line.v, "0.75", "line"), *section.layers])
@@ -232,9 +234,9 @@ def _time_series(figure: PaperFigure, view: View) -> Panel:
     (source,) = view.sources
     point, line = selected(source), motion(source, SERIES_PERIODS)
     side, t = point["side"].values, point["phase"].values + 2.0 * point["period_number"].values
-    again = np.append(False, side[1:] == side[:-1]) & (t <= line.t[-1])
+    repeated = np.append(False, side[1:] == side[:-1]) & (t <= line.t[-1])
     gap = float(point["d"])
-    return time_series(view.title, line, (t[again], 0.5 * gap * side[again]), gap)
+    return time_series(view.title, line, (t[repeated], 0.5 * gap * side[repeated]), gap)
 
 
 _SHOWS: dict[str, Callable[[PaperFigure, View], Panel]] = {

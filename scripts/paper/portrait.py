@@ -22,7 +22,7 @@ _STYLE: Any = STYLE | {
     "lines.linewidth": 0.8,
     "savefig.dpi": 200,
 }
-_LOOKS: dict[str, dict[str, Any]] = {
+_LAYER_STYLES: dict[str, dict[str, Any]] = {
     "dots": {"linestyle": "none", "marker": ".", "markersize": 1.7, "mew": 0},
     "line": {"linestyle": "-"},
     "thick": {"linestyle": "-", "linewidth": 1.6},
@@ -30,40 +30,40 @@ _LOOKS: dict[str, dict[str, Any]] = {
 }
 _WALL: dict[str, Any] = {"color": "firebrick", "linewidth": 1.4, "zorder": 0.5}
 _MARK: dict[str, Any] = {"linestyle": (0, (4, 3)), "linewidth": 0.7, "zorder": 0.6}
-_UNIT_WIDTH, _UNIT_HEIGHT = 1.75, 1.85  # inches of one letter of a layout
-_CAPTION_LETTERS = 21  # of a caption's line, for each inch of the figure
+_UNIT_WIDTH, _UNIT_HEIGHT = 1.75, 1.85  # inches per letter of a layout
+_CAPTION_LETTERS = 21  # letters in a line of a caption, per inch of the figure
 
 
 class Layer(NamedTuple):
     """Points of one colour.
 
     Attributes:
-        x, y: Coordinates of any shape; NaN draws nothing and parts a line.
-        colour: As matplotlib names it.
-        look: How they are drawn.
-        text: What the legend calls the colour, if anything.
+        x, y: Coordinates of any shape; NaN draws nothing and interrupts a line.
+        colour: Colour of matplotlib.
+        style: Style of the points.
+        text: Text of the colour in the legend; empty for none.
     """
 
     x: Any
     y: Any
     colour: str
-    look: Literal["dots", "line", "thick", "rings"] = "dots"
+    style: Literal["dots", "line", "thick", "rings"] = "dots"
     text: str = ""
 
 
 class Panel(NamedTuple):
-    """One picture among small multiples.
+    """A panel of small multiples.
 
     Attributes:
-        title: Above it, after its letter.
-        x, y: What the axes are, as matplotlib writes it.
-        layers: What is drawn, the first below the others.
-        walls: Half the gap, for vertical lines at the walls of a phase plane; None for none.
+        title: Title after the letter.
+        x, y: Labels of the axes, in the notation of matplotlib.
+        layers: Drawn layers, from the bottom to the top.
+        walls: Half the gap, for vertical lines at the walls of a phase plane; None for no lines.
         upright: Places of dashed red vertical lines.
         level: Heights of dashed horizontal lines, with their colour.
-        log: Which axes are logarithmic: "", "x", "y" or "xy".
-        span: Limits of x; None for those of the points.
-        top: Upper limit of a y from 0 on; None for that of the points.
+        log: Logarithmic axes: "", "x", "y" or "xy".
+        span: Limits of x; None for the limits of the points.
+        top: Upper limit of y, with a lower limit of about 0; None for the limits of the points.
     """
 
     title: str
@@ -79,19 +79,20 @@ class Panel(NamedTuple):
 
 
 def phase_plane(title: str, layers: Sequence[Layer], d: float | None) -> Panel:
-    """Make a panel of u' over u with the walls at +-d/2; without walls where panels of several d share it."""
+    """Return a panel of u' over u with the walls at +-d/2; d is None, without walls, for layers of several gaps."""
     return Panel(title, "$u$", r"$\dot{u}$", layers, walls=None if d is None else 0.5 * d)
 
 
 def time_series(title: str, line: Any, impacts: tuple[Any, Any], d: float) -> Panel:
-    """Make a panel of ball and walls over time in the frame of the ground, where a ball in flight goes straight.
+    """Return a panel of ball and walls over time in the frame of the ground, where flights are straight lines.
 
-    The capsule moves by z = cos(pi t)/pi^2 (Z'' = -A cos(omega tau)), fastest where its walls pass +-d/2: dashed blue.
+    The capsule moves by z = cos(pi t)/pi^2 (Z'' = -A cos(omega tau)) and is fastest when its walls pass +-d/2, the
+    dashed blue lines.
 
     Args:
-        title: Above it.
+        title: Title of the panel.
         line: A record with t and u, as `vijax.orbits.motion.curve` returns.
-        impacts: Times and displacements u of the impacts to ring.
+        impacts: Times and displacements u of the impacts marked by rings.
         d: Gap.
     """
     shift = np.cos(np.pi * line.t) / np.pi**2
@@ -113,16 +114,16 @@ def time_series(title: str, line: Any, impacts: tuple[Any, Any], d: float) -> Pa
 def small_multiples(
     panels: dict[str, Panel], layout: Sequence[str], caption: str = "", path: str | Path | None = None
 ) -> Figure:
-    """Set panels side by side over one legend and one caption; a legend each where a colour has several meanings.
+    """Return a figure of panels over a legend and a caption; panels have legends if a colour has several meanings.
 
     Args:
-        panels: By the letter that stands for each in the layout; a capital continues the panel of the small letter.
+        panels: Panels by their letter in the layout; a capital continues the panel of the small letter.
         layout: Rows of letters, as `Figure.subplot_mosaic` takes; "." leaves a place empty.
-        caption: What is to be known beside; broken into lines here.
-        path: Where to write it, if anywhere; the ending chooses the format.
+        caption: Text below the legend; this function breaks it into lines.
+        path: Path of the picture; the suffix selects the format. None writes no file.
 
     Raises:
-        ValueError: If the layout names a panel that is not there, or none names one that is.
+        ValueError: If the letters of the layout differ from the letters of the panels.
     """
     named = set("".join(layout)) - {"."}
     if named != set(panels):
@@ -157,7 +158,9 @@ def _draw(axes: Axes, letter: str, panel: Panel, columns: int) -> None:
     for axis in panel.log:
         axes.set(**{f"{axis}scale": "log"})
     for layer in panel.layers:
-        axes.plot(np.ravel(layer.x), np.ravel(layer.y), color=layer.colour, **_LOOKS[layer.look], rasterized=True)
+        axes.plot(
+            np.ravel(layer.x), np.ravel(layer.y), color=layer.colour, **_LAYER_STYLES[layer.style], rasterized=True
+        )
     if panel.walls is not None:
         for side in (1, -1):
             axes.axvline(side * panel.walls, **_WALL)
@@ -172,16 +175,16 @@ def _draw(axes: Axes, letter: str, panel: Panel, columns: int) -> None:
 
 
 def _key(panel: Panel) -> dict[str, Line2D]:
-    """Make a handle for every text among a panel's layers."""
+    """Return a handle of the legend for every text of a panel's layers."""
     return {
-        layer.text: Line2D([], [], color=layer.colour, **_LOOKS["rings" if layer.look == "rings" else "thick"])
+        layer.text: Line2D([], [], color=layer.colour, **_LAYER_STYLES["rings" if layer.style == "rings" else "thick"])
         for layer in panel.layers
         if layer.text
     }
 
 
 def _wrapped(text: str, width: int) -> str:
-    """Wrap a text to `width` letters; formulas between dollars are not broken."""
+    """Wrap a text to `width` letters; formulas between dollar signs are not broken."""
     lines, words, inside = [""], text.split(" "), False
     for word in words:
         fits = inside or len(lines[-1]) + len(word) < width

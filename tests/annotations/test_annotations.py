@@ -1,4 +1,4 @@
-"""Shapes and types that annotations name are those that come when vijax runs."""
+"""Shapes and types in annotations agree with the values at run time."""
 
 import subprocess
 import sys
@@ -9,9 +9,9 @@ import pytest
 from tests.helpers import cases
 
 
-# The other kinds take a minute and more: `python tests/annotations/tour.py` is the whole tour.
+# The other kinds take more than a minute: `python tests/annotations/tour.py` runs all kinds.
 @pytest.mark.parametrize("kind", cases(["planes", "motions", "orbits"], long=("motions", "orbits")))
-def test_annotations_are_true_of_a_run(kind):
+def test_annotations_agree_with_a_run(kind):
     tour = Path(__file__).parent / "tour.py"
-    done = subprocess.run([sys.executable, tour, kind], capture_output=True, text=True, check=False)
-    assert not done.returncode, done.stderr[-4000:]
+    process = subprocess.run([sys.executable, tour, kind], capture_output=True, text=True, check=False)
+    assert not process.returncode, process.stderr[-4000:]

@@ -1,4 +1,4 @@
-"""What `benchmarks/averages.py` keeps and says of its rows."""
+"""`benchmarks/averages.py`: stored rows, printed statistics and chart."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ ROWS = [
 ]
 
 
-def test_a_part_that_is_measured_again_leaves_the_others_as_they_were(tmp_path, monkeypatch):
+def test_repeated_part_does_not_change_the_rows_of_other_parts(tmp_path, monkeypatch):
     file = tmp_path / "averages.csv"
     tables.write(file, averages.Row._fields, ROWS)
     file.write_text(file.read_text().replace("JAX ", "JAX of another year "))
@@ -27,21 +27,21 @@ def test_a_part_that_is_measured_again_leaves_the_others_as_they_were(tmp_path, 
     monkeypatch.setitem(averages.PARTS, "missed", lambda count: iter([fresh]))
     monkeypatch.setattr("sys.argv", ["averages.py", "--only", "missed", "--rows", str(tmp_path)])
     averages.main()
-    found = tables.read(file)
-    assert [averages.Row(*row[:-1]) for row in found] == [*ROWS[:-1], fresh]
-    assert ["another year" in row.made_by for row in found] == [True] * (len(ROWS) - 1) + [False]
+    rows = tables.read(file)
+    assert [averages.Row(*row[:-1]) for row in rows] == [*ROWS[:-1], fresh]
+    assert ["another year" in row.made_by for row in rows] == [True] * (len(ROWS) - 1) + [False]
 
 
-def test_cells_are_counted_with_both_errors_and_by_verdict(capsys):
+def test_printed_statistics_count_both_errors_and_the_kinds_of_cells(capsys):
     averages.printed(ROWS)
-    said = dict(line.rsplit("  ", 1) for line in capsys.readouterr().out.splitlines())
-    said = {what.strip(): value.strip() for what, value in said.items()}
-    assert said["dP/dkappa, 1 chaotic cells, smooth: within 2 standard errors"] == "100.0%"
-    assert said["dP/dkappa, 2 chaotic cells, all: within 2 standard errors"] == "50.0%"
-    assert said["dP/dkappa, 2 chaotic cells, all: relative error above 1 % in"] == "50.0%"
+    printed = dict(line.rsplit("  ", 1) for line in capsys.readouterr().out.splitlines())
+    printed = {name.strip(): value.strip() for name, value in printed.items()}
+    assert printed["dP/dkappa, 1 chaotic cells, smooth: within 2 standard errors"] == "100.0%"
+    assert printed["dP/dkappa, 2 chaotic cells, all: within 2 standard errors"] == "50.0%"
+    assert printed["dP/dkappa, 2 chaotic cells, all: relative error above 1 % in"] == "50.0%"
 
 
-def test_every_part_has_its_panel(tmp_path):
+def test_parts_have_panels(tmp_path):
     figure = charts.averages(ROWS, tmp_path / "chart.png")
     growth, cells, edge, crisis, missed = figure.axes
     np.testing.assert_allclose(growth.lines[0].get_xydata(), [[1, 0.5], [2, 0.25]])

@@ -1,4 +1,4 @@
-"""Where methods fail: the quick figures of `benchmarks/failures.py`; the usual method is wrong, and vijax is not."""
+"""Scenes of `benchmarks/failures.py` with quick settings: the usual method fails and vijax gives the right result."""
 
 import math
 from functools import cache
@@ -12,12 +12,12 @@ from benchmarks import charts, failures
 
 @cache
 def measured(name):
-    """The quick figures of a scene as two columns: by the usual method, and by vijax."""
+    """Return the quick figures of a scene as two arrays: the usual method and vijax."""
     figures = list(failures.SCENES[name].measure(True))
     return np.array([f.usual for f in figures]), np.array([f.vijax for f in figures])
 
 
-def test_every_scene_has_its_test():
+def test_all_scenes_have_tests():
     assert {f"test_{name}" for name in failures.SCENES} <= set(globals())
 
 
@@ -26,18 +26,18 @@ def test_stability():
     # On the imaginary axis, for an elastic wall, RK4 is stable up to sqrt(8).
     assert failures.stability_limit(1.0) == pytest.approx(math.sqrt(8), abs=1e-3)
     assert 2.6 < limit < 3
-    assert limit < blown < 1.5 * limit  # a contact of few steps ends before it has grown
+    assert limit < blown < 1.5 * limit  # a contact of few steps ends before the error has grown
     assert short < 0.1
     assert ample == 1
     assert np.all(vijax[2:] == 1)
 
 
-def test_the_stability_map_is_drawn(tmp_path):
-    found = failures.stability_map(12)
-    charts.stability_map(found, tmp_path / "map.png")
+def test_stability_map_is_plotted(tmp_path):
+    result = failures.stability_map(12)
+    charts.stability_map(result, tmp_path / "map.png")
     assert np.ptp(matplotlib.image.imread(tmp_path / "map.png")) > 0.5
     with pytest.raises(ValueError, match="plot must end in"):
-        charts.stability_map(found, tmp_path / "map.csv")
+        charts.stability_map(result, tmp_path / "map.csv")
 
 
 @pytest.mark.long
@@ -57,19 +57,19 @@ def test_speeds():
 
 @pytest.mark.long
 def test_labels():
-    (miscounts, restless, _, restless_finer), (miscounted, slow, *_) = measured("labels")
+    (miscounts, aperiodic, _, aperiodic_finer), (miscounted, slow, *_) = measured("labels")
     assert miscounts > 0.05
-    assert min(restless, restless_finer) > 0.3
+    assert min(aperiodic, aperiodic_finer) > 0.3
     assert miscounted == 0
-    assert slow < 0.1  # within 400 periods; the rest are still on their way
+    assert slow < 0.1  # within 400 periods; the other cells have not converged
 
 
 @pytest.mark.long
 def test_gradients():
-    (*blind, _), (*seen, exact) = measured("gradients")
-    assert min(blind) > 0.3  # from 500 to 32,000 steps
-    assert seen[-1] < 1e-6
-    assert seen[-1] < 1e-3 * seen[0]
+    (*usual_errors, _), (*errors, exact) = measured("gradients")
+    assert min(usual_errors) > 0.3  # from 500 to 32,000 steps
+    assert errors[-1] < 1e-6
+    assert errors[-1] < 1e-3 * errors[0]
     assert exact < 1e-6
 
 
@@ -82,11 +82,11 @@ def test_roots():
 
 
 def test_chatter_restarts():
-    (time, still, _), (reached, _, stay) = measured("chatter_restarts")
+    (time, stopped, _), (reached, _, duration) = measured("chatter_restarts")
     assert time < 4
-    assert still > 300
+    assert stopped > 300
     assert reached == 6
-    assert stay > 0.1
+    assert duration > 0.1
 
 
 def test_grazing():
@@ -107,7 +107,7 @@ def test_chatter():
     assert np.any(coarse != exact)
     assert np.all(exact == np.rint(exact))
     assert np.all(np.diff(exact) > 0)  # stiffer walls chatter longer
-    assert np.all(fine == exact)  # steps enough for these: the exact counts are what RK4 tends to
+    assert np.all(fine == exact)  # with enough steps RK4 converges to the exact counts
 
 
 def test_chaos():
@@ -119,10 +119,10 @@ def test_chaos():
 
 @pytest.mark.long
 def test_windows():
-    (many, cells), (found, _) = measured("windows")
+    (many, cells), (multistable, _) = measured("windows")
     assert cells >= 4
     assert many > 0.3
-    assert found == 0  # each of these cells has one attractor
+    assert multistable == 0  # each of these cells has one attractor
 
 
 @pytest.mark.long

@@ -1,4 +1,4 @@
-"""The work-precision tool: its quick setting gives rows, its errors behave, its chart draws them."""
+"""`benchmarks/work_precision.py` with the quick setting: rows, their errors, and the chart."""
 
 import itertools
 import math
@@ -12,8 +12,8 @@ from benchmarks import tables
 from benchmarks import work_precision as tool
 from benchmarks.charts import work_precision
 
-EXACT = 1e-14  # worst measured: 2e-16
-PER_STEP = 5.0  # least gain of a hundredth of the tolerance
+EXACT = 1e-14  # the largest measured error is 2e-16
+PER_STEP = 5.0  # least factor between the errors at two successive settings; tolerances differ by a factor of 100
 
 
 @pytest.fixture(scope="module")
@@ -26,14 +26,14 @@ def rows(tmp_path_factory):
 
 
 def by_method(rows):
-    found = defaultdict(list)
+    groups = defaultdict(list)
     for row in rows:
-        found[row.method].append(row)
-    return found
+        groups[row.method].append(row)
+    return groups
 
 
 @pytest.mark.long
-def test_every_row_has_a_time_and_an_error(rows):
+def test_rows_have_a_time_and_an_error(rows):
     assert {"exact", "ode Tsit5", "numba RK4", "numba DP5 + events", "SciPy DOP853"} == set(by_method(rows))
     for row in rows:
         assert row.us > 0
@@ -56,24 +56,24 @@ def test_errors_fall_with_the_tolerance_and_with_the_step(rows):
 
 
 def test_a_cell_without_a_number_is_a_failure():
-    nothing, something = np.array([np.nan, 1.0, np.inf]), np.zeros(3)
-    error = tool.deviation((nothing, something), (something, something))
+    failed, reference = np.array([np.nan, 1.0, np.inf]), np.zeros(3)
+    error = tool.deviation((failed, reference), (reference, reference))
     assert error.tolist() == [math.inf, 1.0, math.inf]
     assert tool.summary(error) == (math.inf, math.inf, 2)
 
 
-def test_derivative_in_fifty_digits_is_that_of_nearby_runs():
+def test_derivative_in_fifty_digits_agrees_with_finite_differences():
     cells, step = tool.settled(tool.MID), 1e-5
     up, down = (
         np.array(tool.follow(cells._replace(scene=tool.MID._replace(kappa=tool.MID.kappa + nudge))))
         for nudge in (step, -step)
     )
-    true = tool.truth(cells, by_kappa=True)
-    assert (tool.deviation((up - down) / (2 * step), true) < 1e-6 * np.hypot(*true)).all()
+    expected = tool.truth(cells, by_kappa=True)
+    assert (tool.deviation((up - down) / (2 * step), expected) < 1e-6 * np.hypot(*expected)).all()
 
 
 @pytest.mark.long
-def test_the_chart_has_a_panel_a_scene_and_names_every_line(rows, tmp_path):
+def test_chart_has_a_panel_per_scene_and_a_legend_of_all_methods(rows, tmp_path):
     chaotic = [row._replace(scene="chaotic", measure="power", noise=1e-3) for row in rows]
     lost = [row._replace(scene="lost", error=math.inf) if row.method == "numba RK4" else row for row in rows]
     figure = work_precision([*rows, *chaotic, *lost], tmp_path / "chart.png")

@@ -1,4 +1,4 @@
-"""`scripts/basins.py`: from its arguments to a store, a picture and a table, and nothing at all after bad input."""
+"""`scripts/basins.py`: its arguments give a store, a picture and a table; bad input leaves no file."""
 
 import re
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scripts import basins as script
-from vijax.planes import sweep
+from vijax.maps import sweep
 
 TINY = ["--d", "0.2", "--kappa", "3", "--periods", "200"]
 
@@ -35,19 +35,19 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("arguments", "say"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
-def test_bad_input_is_one_line_and_exit_code_2(folder, capsys, monkeypatch, arguments, say):
+@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
+def test_bad_input_prints_a_single_line_and_exits_with_code_2(folder, capsys, monkeypatch, arguments, message):
     monkeypatch.setattr(sweep, "run", None)  # nothing may run
     assert script.main(arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith("error: ")
     assert err.count("\n") == 1
-    assert re.search(say, err)
+    assert re.search(message, err)
     assert list(folder.iterdir()) == []
 
 
-def test_the_default_is_the_whole_gap(folder, monkeypatch):
+def test_the_default_starts_span_the_gap(folder, monkeypatch):
     plans = []
 
     def run(plan, progress):
@@ -63,33 +63,33 @@ def test_the_default_is_the_whole_gap(folder, monkeypatch):
         "kappa": 3,
         "r": 0.5,
     }
-    np.testing.assert_allclose(plan.cells.given["u0"].values[[0, -1]], [-0.1 + 0.1 / 256, 0.1 - 0.1 / 256])
-    np.testing.assert_allclose(plan.cells.given["v0"].values[[0, -1]], [-0.6, 0.6])
+    np.testing.assert_allclose(plan.cells.axes["u0"].values[[0, -1]], [-0.1 + 0.1 / 256, 0.1 - 0.1 / 256])
+    np.testing.assert_allclose(plan.cells.axes["v0"].values[[0, -1]], [-0.6, 0.6])
 
 
-def test_a_plane_of_starts_to_store_picture_and_table(folder, capsys):
+def test_a_map_of_starts_is_written_as_store_picture_and_table(folder, capsys):
     assert script.main([*TINY, "--v0=-0.6:0.6:24", "--merge-mirrors"]) == 0
     assert sorted(path.name for path in folder.iterdir()) == ["basins.png", "basins.zarr"]
-    found = sweep.load(folder / "basins.zarr")
-    assert dict(found.sizes) == {"u0": 24, "v0": 24, "attractor": 3}
-    said = capsys.readouterr().out
-    assert "576 starts in" in said
-    assert "mirror images as one" in said
-    for label, starts in zip(found.label.values, found.starts.values, strict=True):
-        assert re.search(rf"^{label} +{starts} ", said, re.MULTILINE), said
+    dataset = sweep.load(folder / "basins.zarr")
+    assert dict(dataset.sizes) == {"u0": 24, "v0": 24, "attractor": 3}
+    output = capsys.readouterr().out
+    assert "576 starts in" in output
+    assert "mirror images as one" in output
+    for label, starts in zip(dataset.label.values, dataset.starts.values, strict=True):
+        assert re.search(rf"^{label} +{starts} ", output, re.MULTILINE), output
 
 
-def test_a_plane_of_parameters_counts_attractors(folder, capsys):
+def test_a_map_of_parameters_counts_attractors(folder, capsys):
     arguments = ["--d", "0.19,0.2", "--kappa", "3,3.2", "--periods", "200", "--starts", "40", "--plot", "map.png"]
     assert script.main([*arguments, "--out", "map.zarr"]) == 0
-    found = sweep.load(folder / "map.zarr")
-    assert dict(found.sizes) == {"d": 2, "kappa": 2, "start": 40, "attractor": found.sizes["attractor"]}
-    numbers, cells = np.unique(found.attractors, return_counts=True)
+    dataset = sweep.load(folder / "map.zarr")
+    assert dict(dataset.sizes) == {"d": 2, "kappa": 2, "start": 40, "attractor": dataset.sizes["attractor"]}
+    numbers, cells = np.unique(dataset.attractors, return_counts=True)
     tally = ", ".join(f"{number}: {count}" for number, count in zip(numbers, cells, strict=True))
     assert f"cells by number of attractors: {tally}\n" in capsys.readouterr().out
     assert (folder / "map.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_only_looks_like_an_attractor_says_for_how_long(folder, capsys):
+def test_an_aperiodic_attractor_has_its_simulated_periods(folder, capsys):
     assert script.main(["--d", "0.3", "--kappa", "3", "--periods", "200", "--v0=-0.6:0.6:5", "--out", "a.zarr"]) == 0
-    assert re.search(r"^aperiodic .* looked for (200|800|3200) periods$", capsys.readouterr().out, re.MULTILINE)
+    assert re.search(r"^aperiodic .* simulated (200|800|3200) periods$", capsys.readouterr().out, re.MULTILINE)

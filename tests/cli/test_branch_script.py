@@ -1,4 +1,4 @@
-"""`scripts/branch.py`: where its branches begin, and nothing at all after bad input."""
+"""`scripts/branch.py`: the starts of its branches, and no file after bad input."""
 
 import pytest
 
@@ -14,27 +14,27 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_a_branch_begins_within_its_bounds_where_the_device_does_not_lie_there(folder, capsys):
-    # The device of Tables I and II turns at pi rad/s.
+def test_a_branch_starts_within_bounds_that_exclude_the_device(folder, capsys):
+    # The device of Tables I and II is forced at pi rad/s.
     assert script.main([*SHAKEN, "--along", "omega=4.8Hz:5.2Hz", "--out", "branch.zarr"]) == 0
     assert "1:1: omega 30.1593 to 32.6726" in capsys.readouterr().out
-    found = vijax.load(folder / "branch.zarr")
-    assert found.attrs["along"] == "omega"
-    assert {str(found[f"end_{end}"].values[0]) for end in ("first", "last")} == {"low", "high"}
+    dataset = vijax.load(folder / "branch.zarr")
+    assert dataset.attrs["along"] == "omega"
+    assert {str(dataset[f"end_{end}"].values[0]) for end in ("first", "last")} == {"low", "high"}
 
 
 @pytest.mark.long
-def test_a_branch_of_another_membrane_says_which(folder, capsys):
-    told = ["--kappa", "40", "--along", "d=0.19:0.21", "--membrane", "hunt-crossley", "--chi", "0.3"]
-    assert script.main([*told, "--guesses", "32", "--max-switches", "0", "--out", "branch.zarr"]) == 0
+def test_the_output_of_a_branch_names_its_membrane(folder, capsys):
+    arguments = ["--kappa", "40", "--along", "d=0.19:0.21", "--membrane", "hunt-crossley", "--chi", "0.3"]
+    assert script.main([*arguments, "--guesses", "32", "--max-switches", "0", "--out", "branch.zarr"]) == 0
     assert "met pitchfork 0.19705393" in capsys.readouterr().out
-    found = vijax.load(folder / "branch.zarr")
-    assert found.attrs["membrane"] == "hunt-crossley with chi 0.3, exponent 1.5"
-    assert "r" not in found.coords
+    dataset = vijax.load(folder / "branch.zarr")
+    assert dataset.attrs["membrane"] == "hunt-crossley with chi 0.3, exponent 1.5"
+    assert "r" not in dataset.coords
 
 
 @pytest.mark.parametrize(
-    ("arguments", "say"),
+    ("arguments", "message"),
     [
         (
             ["--wall", "soft", "--r_left", "0.5", "--membrane", "hunt-crossley", "--chi", "0.3"],
@@ -42,7 +42,7 @@ def test_a_branch_of_another_membrane_says_which(folder, capsys):
         ),
         (
             ["--wall", "soft", "--along", "r=0.3:0.5", "--membrane", "hunt-crossley", "--chi", "0.3"],
-            "the loss of this membrane is told by its law, not by r",
+            "the law of this membrane specifies its loss, not r",
         ),
         (
             ["--wall", "soft", "--harmonics", "1,-1", "--phases", "0,0,0"],
@@ -63,32 +63,32 @@ def test_a_branch_of_another_membrane_says_which(folder, capsys):
         (["--along", "s=1Hz:2Hz"], "s must be in m"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2(folder, capsys, arguments, say):
+def test_bad_input_prints_a_single_line_and_exits_with_code_2(folder, capsys, arguments, message):
     assert script.main([*SHAKEN, *arguments]) == 2
-    said = capsys.readouterr().err.strip().splitlines()[-1]
-    assert said.startswith("error: ")
-    assert say in said
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    assert line.startswith("error: ")
+    assert message in line
     assert not list(folder.iterdir())
 
 
 @pytest.mark.long
-def test_a_branch_under_harmonics_says_which(folder, capsys):
-    told = ["--kappa", "40", "--along", "d=0.19:0.21", "--harmonics", "1,0.3", "--phases", "0,0.7"]
-    assert script.main([*told, "--guesses", "32", "--max-switches", "0", "--out", "branch.zarr"]) == 0
-    found = vijax.load(folder / "branch.zarr")
-    assert found.attrs["excitation"] == "harmonics 1.0, 0.3 at 0.7 rad"
+def test_the_output_of_a_branch_names_its_harmonics(folder, capsys):
+    arguments = ["--kappa", "40", "--along", "d=0.19:0.21", "--harmonics", "1,0.3", "--phases", "0,0.7"]
+    assert script.main([*arguments, "--guesses", "32", "--max-switches", "0", "--out", "branch.zarr"]) == 0
+    dataset = vijax.load(folder / "branch.zarr")
+    assert dataset.attrs["excitation"] == "harmonics 1.0, 0.3 at 0.7 rad"
     assert "orbits stable" in capsys.readouterr().out
 
 
-def test_harmonics_reach_the_search(folder, capsys, monkeypatch):
-    seen = []
+def test_harmonics_are_passed_to_the_search(folder, capsys, monkeypatch):
+    excitations = []
 
-    def search(pair, impacts, **told):
-        seen.append(told["excitation"])
+    def search(pair, impacts, **settings):
+        excitations.append(settings["excitation"])
         raise ValueError("enough")
 
-    monkeypatch.setattr("vijax.orbits.orbit_search.search", search)
+    monkeypatch.setattr("vijax.orbits.orbit_search.find_orbits", search)
     assert script.main(["--kappa", "40", "--harmonics", "1,0.3", "--phases", "0,0.7"]) == 2
     assert capsys.readouterr().err.strip().endswith("enough")
-    assert seen == [vijax.Harmonics([1.0, 0.3], [0.0, 0.7])]
+    assert excitations == [vijax.Harmonics([1.0, 0.3], [0.0, 0.7])]
     assert not list(folder.iterdir())

@@ -1,4 +1,4 @@
-"""`scripts/curves.py`: what it writes of a map, run or loaded, and one line after bad input."""
+"""`scripts/curves.py`: files of the curves of a simulated or loaded map, and one line after bad input."""
 
 import numpy as np
 import pytest
@@ -6,10 +6,10 @@ import pytest
 import vijax
 from scripts import curves as script
 from scripts import grid
-from vijax.orbits import map_curves
+from vijax.continuation.from_map import map_curves
 from vijax.plots.style import is_drawn
 
-# A corner of rigid walls in which the symmetric orbit breaks, with as many cells as `orbits/test_curves` has.
+# A map of rigid walls with a pitchfork of the symmetric orbit, with as many cells as in `continuation/test_curves`.
 PLANE = ["--wall", "rigid", "--d", "0.24:0.3:4", "--r", "0.4:0.6:4"]
 
 
@@ -19,24 +19,24 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_a_map_is_run_and_its_curves_are_written_three_ways(folder, capsys):
+def test_a_map_is_simulated_and_its_curves_are_written_to_three_files(folder, capsys):
     assert script.main([*PLANE, "--max-rounds", "0"]) == 0
-    said = capsys.readouterr().out
-    found = vijax.load(folder / "curves.zarr")
-    assert "pitchfork" in found["kind"].values
-    assert f"of {found.attrs['borders']:,}" in said
+    output = capsys.readouterr().out
+    dataset = vijax.load(folder / "curves.zarr")
+    assert "pitchfork" in dataset["kind"].values
+    assert f"of {dataset.attrs['borders']:,}" in output
     rows = (folder / "curves.csv").read_text().splitlines()
-    assert len(rows) == 1 + int(np.isfinite(found["d"]).sum())
+    assert len(rows) == 1 + int(np.isfinite(dataset["d"]).sum())
     assert is_drawn(folder / "curves.png")
 
 
 def stopped(dataset, **budget):
-    """Stand in for a search that Ctrl-C ends once it has curves: it tells its progress after each batch of them."""
-    told = []
+    """Run a search that Ctrl-C ends after its first curves: it reports its progress after each batch of curves."""
+    steps = []
 
     def stop(*step):
-        told.append(step)
-        if len(told) > 1:
+        steps.append(step)
+        if len(steps) > 1:
             raise KeyboardInterrupt
 
     return SEARCH(dataset, progress=stop)
@@ -45,7 +45,7 @@ def stopped(dataset, **budget):
 SEARCH = map_curves.bifurcation_curves
 
 
-def test_ctrl_c_keeps_what_was_found_and_says_so(folder, capsys, monkeypatch):
+def test_ctrl_c_saves_partial_results_and_reports_them(folder, capsys, monkeypatch):
     assert grid.main([*PLANE, "--kappa", "400", "--out", "map.zarr"]) == 0
     monkeypatch.setattr(map_curves, "bifurcation_curves", stopped)
     assert script.main(["--map", "map.zarr", "--out", "curves.zarr"]) == 130
@@ -63,7 +63,7 @@ def test_a_map_may_be_drawn_with_its_curves(folder, capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "say"),
+    ("arguments", "message"),
     [
         (["--map", "nowhere.zarr"], "--map: path must name a zarr store"),
         (["--map", "nowhere.zarr", "--d", "0.2"], "d must be left out with map"),
@@ -83,15 +83,15 @@ def test_a_map_may_be_drawn_with_its_curves(folder, capsys):
         (["--max-seconds", "-1"], "max_seconds must be a positive number"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2(folder, capsys, arguments, say):
+def test_bad_input_prints_a_single_line_and_exits_with_code_2(folder, capsys, arguments, message):
     assert script.main(arguments) == 2
-    said = capsys.readouterr().err.strip().splitlines()[-1]
-    assert said.startswith("error: ")
-    assert say in said
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    assert line.startswith("error: ")
+    assert message in line
     assert not list(folder.iterdir())
 
 
-def test_a_store_without_labels_is_told(folder, capsys):
+def test_a_store_without_labels_is_rejected(folder, capsys):
     vijax.save(vijax.sweep(d=[0.2, 0.3], kappa=[3.0, 40.0], outputs=["P"], periods=40), "map.zarr")
     assert script.main(["--map", "map.zarr"]) == 2
     assert "--map: dataset must hold period" in capsys.readouterr().err

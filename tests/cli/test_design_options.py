@@ -1,12 +1,12 @@
-"""What a line of `vijax design` says of tolerances."""
+"""Tolerances in the options of `vijax design`."""
 
 import pytest
 
-from vijax.cli.design import _tolerances
-from vijax.design.tolerance import Tolerance
+from vijax.cli.commands.design import _tolerances
+from vijax.design.robustness.tolerance import Tolerance
 
 
-def test_what_may_be_tuned_may_scatter():
+def test_constants_that_may_be_tuned_may_have_a_tolerance():
     assert _tolerances(["k=5%,s=0.02"]) == (Tolerance("k", 0.05), Tolerance("s", 0.02))
     with pytest.raises(ValueError, match="--tolerance: tolerances must name a constant once; got k, omega0"):
         _tolerances(["k=5%,omega0=5%"])

@@ -1,4 +1,4 @@
-"""`scripts/grid.py`: from its arguments to a store and a picture, and nothing at all after bad input or Ctrl-C."""
+"""`scripts/grid.py`: its arguments give a store and a picture; bad input leaves no file."""
 
 import logging
 import os
@@ -17,11 +17,11 @@ import vijax
 from scripts import grid as script
 from tests.helpers import SCRIPTS, no_cell_runs
 from vijax.cli import closing, progress
-from vijax.cli.sweep import _place
-from vijax.cli.sweep import sweep as sweep_page
+from vijax.cli.commands.sweep import _place
+from vijax.cli.commands.sweep import sweep as sweep_page
+from vijax.maps import map_dataset, outputs, sweep
+from vijax.maps.sweep_settings import SweepSettings
 from vijax.model.records import Status
-from vijax.planes import dataset, outputs, sweep
-from vijax.planes.sweep_settings import SweepSettings
 from vijax.plots import figure, kind_maps, number_maps
 from vijax.plots.style import axis_label
 
@@ -52,7 +52,7 @@ BAD = [
     (["--r", "1.2"], r"r must lie in \(0, 1\]; got 1.2"),
     (["--d", "0"], "d must be positive"),
     (["--workers", "0"], "workers must be a whole number of at least 1; got 0"),
-    (["--workers", "2", "--plot", "map.png"], "workers must come with out"),
+    (["--workers", "2", "--plot", "map.png"], "workers requires out"),
     (["--workers", "2", "--scheduler", "10.0.0.1:8786"], "workers must be left out with scheduler"),
     (["--workers", "2", "--compare", "rigid"], "workers must be left out with compare"),
     (["--workers", "2", "--out", "map.zarr", "--refine", "2"], "workers must be left out with refine"),
@@ -114,9 +114,9 @@ BAD = [
     (["--compare", "rigid", "--tolerance", "0"], "tolerance must be a positive number"),
     (["--compare", "rigid", "--tolerance=-0.1"], "tolerance must be a positive number"),
     (["--compare", "rigid", "--tolerance", "nan"], "tolerance must be a positive number"),
-    (["--compare", "rigid", "--tolerance", "5 percent"], "tolerance must be a part such as 5% or 0.05"),
+    (["--compare", "rigid", "--tolerance", "5 percent"], "tolerance must be a fraction such as 5% or 0.05"),
     (["--compare", "rigid", "--tolerance=-5%"], "tolerance must be a positive number"),
-    (["--compare", "rigid", "--tolerance", "5"], "tolerance must be a part such as 5% or 0.05; got '5'; write 5%"),
+    (["--compare", "rigid", "--tolerance", "5"], "tolerance must be a fraction such as 5% or 0.05; got '5'; write 5%"),
     (["--compare", "soft"], "compare must be"),
     (["--compare", "rigid", "--wall", "rigid"], "wall must not be chosen with compare"),
     (["--compare", "rigid", "--outputs", "P"], "outputs must not be chosen with compare"),
@@ -142,20 +142,20 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("arguments", "say"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
-def test_bad_input_is_one_line_and_exit_code_2(folder, capsys, monkeypatch, arguments, say):
+@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
+def test_bad_input_prints_a_single_line_and_exits_with_code_2(folder, capsys, monkeypatch, arguments, message):
     monkeypatch.setattr(sweep, "run", None)  # nothing may run
     assert script.main(arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith("error: ")
     assert err.count("\n") == 1
-    assert re.search(say, err)
+    assert re.search(message, err)
     assert list(folder.iterdir()) == []
 
 
 @pytest.mark.parametrize(("option", "name"), [("--out", "map.zarr"), ("--plot", "map.png")])
-def test_what_exists_is_found_before_the_run(folder, capsys, monkeypatch, option, name):
+def test_existing_files_are_detected_before_the_run(folder, capsys, monkeypatch, option, name):
     monkeypatch.setattr(sweep, "run", None)
     (folder / name).write_text("precious")
     assert script.main([option, name]) == 2
@@ -165,7 +165,7 @@ def test_what_exists_is_found_before_the_run(folder, capsys, monkeypatch, option
 
 @pytest.fixture
 def planned(monkeypatch, folder):
-    """What the script asks `run` for."""
+    """Return a function that runs the script and returns the plan that it passes to `run`."""
     plans = []
 
     def run(plan, *args):
@@ -184,7 +184,7 @@ def planned(monkeypatch, folder):
 def test_default_plane(planned):
     plan = planned()
     assert plan.cells.sizes == {"d": 128, "kappa": 128}
-    d, kappa = plan.cells.given["d"].values, plan.cells.given["kappa"].values
+    d, kappa = plan.cells.axes["d"].values, plan.cells.axes["kappa"].values
     np.testing.assert_allclose(d, np.linspace(0.05, 0.3, 128))
     np.testing.assert_allclose(kappa, np.geomspace(3, 400, 128))
     quantities = {name: float(plan.cells.quantities[name]) for name in ("r", "gamma", "omega")}
@@ -204,32 +204,32 @@ def test_default_plane(planned):
         (["--k", "300,560", "--d", "0.1,0.2", "--beta=-0.1,0.1"], {"k": 2, "d": 2, "beta": 2}),
     ],
 )
-def test_axes_in_the_order_given(planned, arguments, sizes):
+def test_axes_in_the_specified_order(planned, arguments, sizes):
     if sizes is None:
         assert script.main(arguments) == 2
     else:
         assert planned(*arguments).cells.sizes == sizes
 
 
-def test_settings_and_constants_arrive(planned):
+def test_settings_and_constants_are_passed_on(planned):
     settings = ["--until", "window", "--transient", "5", "--periods", "7", "--wall", "rigid"]
     plan = planned(*settings, "--set", "V=1000", "--set", "m_b=0.01")
     assert plan.settings == SweepSettings(until="window", transient=5, periods=7, wall="rigid")
     assert (plan.device.V, plan.device.m_b) == (1000.0, 0.01)
 
 
-def test_walls_that_differ_arrive(planned):
-    """What one wall is given takes the default of both away."""
-    given = planned("--kappa_left", "20:40:3", "--r_right", "0.6", "--set", "V_left=1500")
-    assert list(given.cells.sizes) == ["d", "kappa_left"]
-    assert given.cells.unequal
-    assert float(given.cells.quantities["r_right"]) == 0.6
-    assert (float(given.device.V.left), float(given.device.V.right)) == (1500.0, 2000.0)
+def test_unequal_walls_are_passed_on(planned):
+    """A value for one wall replaces the default of both walls."""
+    plan = planned("--kappa_left", "20:40:3", "--r_right", "0.6", "--set", "V_left=1500")
+    assert list(plan.cells.sizes) == ["d", "kappa_left"]
+    assert plan.cells.has_unequal_walls
+    assert float(plan.cells.quantities["r_right"]) == 0.6
+    assert (float(plan.device.V.left), float(plan.device.V.right)) == (1500.0, 2000.0)
     assert planned("--wall", "rigid_left").settings.wall == "rigid_left"
     assert planned("--set", "w0_left=0.2mm").device.w0.left == pytest.approx(2e-4, rel=1e-12)
 
 
-def test_methods_and_membranes_arrive(planned):
+def test_methods_and_membranes_are_passed_on(planned):
     plan = planned("--method", "ode", "--solver", "Dopri8", "--rtol", "1e-9", "--atol", "1e-11")
     assert (plan.method.solver, plan.method.rtol, plan.method.atol) == ("Dopri8", 1e-9, 1e-11)
     plan = planned("--method", "ode", "--membrane", "hunt-crossley", "--chi", "0.5", "--exponent", "1.4")
@@ -245,13 +245,13 @@ def test_methods_and_membranes_arrive(planned):
     assert planned().method is None
 
 
-def test_labels_are_shown_with_exponents(folder, monkeypatch):
+def test_a_map_of_labels_requests_exponents(folder, monkeypatch):
     plans, drawn = [], []
     ok = xr.Variable("d", [0, 0], {"flag_values": [0], "flag_meanings": "ok"})
     monkeypatch.setattr(
         sweep, "run", lambda plan, *args: plans.append(plan) or args[0](0, 1) or xr.Dataset({"status": ok})
     )
-    monkeypatch.setattr(kind_maps, "label_map", lambda found: "labels")
+    monkeypatch.setattr(kind_maps, "label_map", lambda dataset: "labels")
     monkeypatch.setattr(figure, "save", lambda made, path: drawn.append((made, path.name)))
     assert script.main(["--show", "label", "--plot", "labels.png"]) == 0
     assert {"lyapunov", "P", "period"} < set(plans[0].outputs)
@@ -259,21 +259,21 @@ def test_labels_are_shown_with_exponents(folder, monkeypatch):
     assert drawn == [("labels", "labels.png")]
 
 
-def test_a_refined_map_says_how_much_was_computed(folder, monkeypatch, capsys):
+def test_a_refined_map_reports_its_computed_cells(folder, monkeypatch, capsys):
     plans = []
     ok = xr.Variable("d", [0, 0], {"flag_values": [0], "flag_meanings": "ok"})
-    found = xr.Dataset(
+    dataset = xr.Dataset(
         {"status": ok, "computed": ("d", [True, False])}, attrs={"refine_computed": 1, "refine_shown": 2}
     )
 
-    def run(plan, tell, *_):
+    def run(plan, report, *_):
         plans.append(plan)
-        tell(0, 1)
-        tell(1, 1)
-        return found
+        report(0, 1)
+        report(1, 1)
+        return dataset
 
     monkeypatch.setattr(sweep, "run", run)
-    monkeypatch.setattr(number_maps, "power_map", lambda found: None)
+    monkeypatch.setattr(number_maps, "power_map", lambda dataset: None)
     monkeypatch.setattr(figure, "save", lambda made, path: None)
     assert script.main(["--refine", "3", "--plot", "map.png"]) == 0
     assert plans[0].refine == 3
@@ -293,11 +293,11 @@ def test_a_summary_counts_inadmissible_cells_by_limit():
 
 
 @pytest.mark.long
-def test_a_wide_gap_from_one_start_says_that_starts_matter():
+def test_a_wide_gap_with_a_single_start_advises_more_starts():
     d = xr.DataArray([0.2, 0.21], dims="d")
     level, inclined = (xr.Dataset(coords={"d": d, "gamma": gamma}) for gamma in (0.0, 0.1))
     (line,) = closing.wide_gap_lines(level, "vijax sweep ")
-    assert line.startswith("d > 2/pi^2 on level ground in 50.0% of the cells")
+    assert line.startswith("d > 2/pi^2 at gamma = 0 in 50.0% of the cells")
     assert line.endswith("try vijax sweep --starts 64")
     assert "everywhere" in closing.wide_gap_lines(level.isel(d=[1]))[0]
     assert not closing.wide_gap_lines(level.isel(d=[0]))
@@ -306,7 +306,7 @@ def test_a_wide_gap_from_one_start_says_that_starts_matter():
     assert not closing.wide_gap_lines(level.expand_dims(v0=[0.1, 0.2]))
 
 
-def test_hertz_are_shown_where_they_were_given(folder, capsys, monkeypatch):
+def test_axes_are_in_hertz_where_they_were_specified_in_hertz(folder, capsys, monkeypatch):
     drawn = []
     monkeypatch.setattr(number_maps, "power_map", drawn.append)
     monkeypatch.setattr(figure, "save", lambda made, path: None)
@@ -324,16 +324,16 @@ def test_hertz_are_shown_where_they_were_given(folder, capsys, monkeypatch):
     )
 
 
-def test_the_best_cell_is_in_hertz_where_they_were_given():
-    place = xr.DataArray(2e-5, {"omega": ((), 4 * np.pi, {"units": "rad s-1"}), "d": 0.2})
-    found = place.expand_dims("omega").to_dataset(name="P")
-    said = {}
+def test_the_best_cell_is_in_hertz_where_it_was_specified_in_hertz():
+    cell = xr.DataArray(2e-5, {"omega": ((), 4 * np.pi, {"units": "rad s-1"}), "d": 0.2})
+    dataset = cell.expand_dims("omega").to_dataset(name="P")
+    texts = {}
     for omega in ("1Hz:2Hz:3", "7:12:3"):
         with click.Context(sweep_page, info_name="sweep") as context:
             context.params = {"omega": omega}
-            said[omega] = _place(found["P"][0], found)
-    assert said["1Hz:2Hz:3"] == "2e-05 J per half period, 8e-05 W at omega = 2 Hz"
-    assert said["7:12:3"].endswith("at omega = 12.5664 rad s-1")
+            texts[omega] = _place(dataset["P"][0], dataset)
+    assert texts["1Hz:2Hz:3"] == "2e-05 J per half period, 8e-05 W at omega = 2 Hz"
+    assert texts["7:12:3"].endswith("at omega = 12.5664 rad s-1")
 
 
 @pytest.mark.long
@@ -341,26 +341,28 @@ def test_several_starts_from_arguments_to_store_and_picture(folder, capsys):
     names = ["--out", "expected.zarr", "--plot", "expected.png"]
     assert script.main([*TINY, "--starts", "5", *names]) == 0
     assert "cells by attractors found: 1 " in capsys.readouterr().out
-    kept = sweep.load(folder / "expected.zarr")
-    assert kept.attrs["starts"] == 5
-    assert "best_share" in kept
+    dataset = sweep.load(folder / "expected.zarr")
+    assert dataset.attrs["starts"] == 5
+    assert "best_share" in dataset
     assert (folder / "expected.png").stat().st_size > 0
 
 
-@pytest.mark.parametrize(("admissible", "says"), [(True, "admissible\n"), (False, "inadmissible; see docs: model\n")])
-def test_one_cell_has_no_picture_unless_asked_for_and_its_energy_is_said(folder, capsys, monkeypatch, admissible, says):
+@pytest.mark.parametrize(
+    ("admissible", "message"), [(True, "admissible\n"), (False, "inadmissible; see docs: model\n")]
+)
+def test_a_single_cell_has_no_picture_and_its_energy_is_printed(folder, capsys, monkeypatch, admissible, message):
     ok = ("d", [0], {"flag_values": [0], "flag_meanings": "ok"})
-    found = xr.Dataset({"status": ok, "P": ("d", [2e-5]), "admissible": ("d", [admissible])}, {"omega": np.pi})
+    dataset = xr.Dataset({"status": ok, "P": ("d", [2e-5]), "admissible": ("d", [admissible])}, {"omega": np.pi})
 
-    def run(plan, tell, *_):
-        tell(0, 1)
-        tell(1, 1)
-        return found
+    def run(plan, report, *_):
+        report(0, 1)
+        report(1, 1)
+        return dataset
 
     monkeypatch.setattr(sweep, "run", run)
     assert script.main(["--d", "0.1", "--kappa", "50"]) == 0
     out = capsys.readouterr().out
-    assert f"P: 2e-05 J per half period, 2e-05 W, {says}" in out
+    assert f"P: 2e-05 J per half period, 2e-05 W, {message}" in out
     assert "wrote power_map.zarr\n" in out
 
 
@@ -372,23 +374,23 @@ def test_the_progress_bar_follows_a_total_that_grows(capsys):
 
 
 def test_from_arguments_to_store_and_picture(folder, monkeypatch):
-    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")  # so that the programs are kept where vijax does by itself
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")  # programs are stored in the default folder
     process = started([*TINY, "--out", "map.zarr", "--plot", "map.png"], folder)
     out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
-    found = sweep.load(folder / "map.zarr")
-    assert dict(found.sizes) == {"d": 2, "kappa": 3}
+    dataset = sweep.load(folder / "map.zarr")
+    assert dict(dataset.sizes) == {"d": 2, "kappa": 3}
     assert (folder / "map.png").read_bytes().startswith(b"\x89PNG")
-    assert "6/6" in err.replace(".00", "")  # the progress bar has come to its end
-    peak = dataset.best(found)
+    assert "6/6" in err.replace(".00", "")  # the progress bar has reached its end
+    peak = map_dataset.best(dataset)
     for part in (
         "6 cells in",
         "cells/s",
         "by status: ok 6",
         "by period: period 1 ",
-        f"inadmissible cells: {int((~found['admissible']).sum())} of 6",
+        f"inadmissible cells: {int((~dataset['admissible']).sum())} of 6",
         f"{float(peak):.6g} J per half period, {float(peak):.6g} W at",
-        "d > 2/pi^2 on level ground in 50.0% of the cells: the motion depends on the start, and this is that of one; "
+        "d > 2/pi^2 at gamma = 0 in 50.0% of the cells: the motion depends on the start, and this map has one start; "
         "try --starts 64",
     ):
         assert part in out, part
@@ -397,25 +399,25 @@ def test_from_arguments_to_store_and_picture(folder, monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGINT reaches no single process there")
-def test_ctrl_c_leaves_what_is_done(folder):
+def test_ctrl_c_retains_the_finished_cells(folder):
     process = started(["--d", "0.05:0.3:512", "--kappa", "3:400:512:log", "--out", "map.zarr"], folder)
     try:
         while not (folder / "map.zarr").exists():
             assert process.poll() is None, process.stderr.read()
             time.sleep(0.05)
-        time.sleep(1)  # until it is at the tiles
+        time.sleep(1)  # until it simulates tiles
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=30)
     finally:
         process.kill()
     assert process.returncode == 130
-    assert err.endswith("stopped; 0 of 262,144 cells are in map.zarr; the same command goes on from there\n")
+    assert err.endswith("stopped; 0 of 262,144 cells are in map.zarr; the same command continues from there\n")
     assert {path.name for path in folder.iterdir()} <= {"cache", "map.zarr"}
     assert (sweep.load(folder / "map.zarr")["status"] == Status.NOT_RUN).all()
 
 
 @pytest.mark.long
-def test_the_bar_says_what_is_waited_for(folder, capsys):
+def test_the_bar_shows_the_current_stage(folder, capsys):
     assert script.main([*TINY, "--out", "map.zarr"]) == 0
     err = capsys.readouterr().err
     assert err.index("starting") < err.index("compiling") < err.index("running 6 cells side by side") < err.index("6/6")
@@ -423,14 +425,14 @@ def test_the_bar_says_what_is_waited_for(folder, capsys):
 
 
 @pytest.mark.parametrize(
-    ("count", "seconds", "said"),
+    ("count", "seconds", "text"),
     [(12, 35.0, "0.343 cells/s"), (3, 1.0, "3 cells/s"), (26395, 1.0, "26,395 cells/s"), (0, 1.0, "0 cells/s")],
 )
-def test_a_slow_rate_has_digits(count, seconds, said):
-    assert closing.pace(count, seconds).endswith(f" {said}")
+def test_a_slow_rate_has_decimals(count, seconds, text):
+    assert closing.rate_text(count, seconds).endswith(f" {text}")
 
 
-def test_what_to_do_is_said_where_a_status_is_printed():
+def test_advice_is_printed_with_a_status():
     status = outputs.flagged(xr.Variable("d", [0, 4, 4, 2]), Status)
     lines = closing.statuses(xr.DataArray(status)).split("\n")
     assert lines[0] == "cells by status: ok 1, permanent_contact 1, slow 2"
@@ -439,6 +441,6 @@ def test_what_to_do_is_said_where_a_status_is_printed():
 
 
 @pytest.mark.long
-def test_any_variable_is_shown(folder):
+def test_any_variable_can_be_plotted(folder):
     assert script.main([*TINY, "--show", "max_penetration", "--outputs", "P,max_penetration"]) == 0
     assert {path.name for path in folder.iterdir()} == {"max_penetration_map.zarr", "max_penetration_map.png"}

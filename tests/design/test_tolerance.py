@@ -1,11 +1,11 @@
-"""Quadrature nodes of tolerances integrate what they must; what cannot be a tolerance is refused."""
+"""Quadrature nodes of tolerances integrate accurately, and invalid tolerances raise."""
 
 import numpy as np
 import pytest
 
-from vijax.design.tolerance import Tolerance, check_tolerances, nodes
+from vijax.design.robustness.tolerance import Tolerance, nodes, validate_tolerances
 from vijax.model.device import Harvester
-from vijax.model.variables import scattered
+from vijax.model.tuned_quantities import with_factors
 
 
 def mean(cloud, function):
@@ -43,9 +43,13 @@ def test_two_constants_are_independent():
     assert mean(cloud, lambda x: x[:, 0] ** 2 * x[:, 1]) == pytest.approx(expected, rel=1e-13)
 
 
-def test_samples_are_drawn_alike_every_time():
-    one = (Tolerance("omega0", 0.05), Tolerance("r", 0.1, "lognormal"))
-    first, again, other = nodes(one, 4000, seed=1), nodes(one, 4000, seed=1), nodes(one, 4000, seed=2)
+def test_samples_are_reproducible():
+    tolerances = (Tolerance("omega0", 0.05), Tolerance("r", 0.1, "lognormal"))
+    first, again, other = (
+        nodes(tolerances, 4000, seed=1),
+        nodes(tolerances, 4000, seed=1),
+        nodes(tolerances, 4000, seed=2),
+    )
     np.testing.assert_array_equal(first.factors, again.factors)
     assert (first.factors[1:] != other.factors[1:]).any()
     spread = first.factors[1:].std(axis=0)
@@ -63,26 +67,26 @@ def test_samples_are_drawn_alike_every_time():
         (("omega0", 0.05, "normal"), 'kind must be "uniform" or "lognormal"'),
     ],
 )
-def test_what_cannot_be_is_refused_when_it_is_made(tolerance, words):
+def test_invalid_tolerances_raise(tolerance, words):
     with pytest.raises(ValueError, match=words):
         Tolerance(*tolerance)
 
 
-def test_a_worst_case_wants_distributions_that_end():
+def test_worst_case_requires_bounded_distributions():
     with pytest.raises(ValueError, match="worst case must be uniform"):
-        check_tolerances((Tolerance("omega0", 0.05, "lognormal"),), True)
+        validate_tolerances((Tolerance("omega0", 0.05, "lognormal"),), True)
 
 
-def test_a_constant_scatters_once():
+def test_repeated_constant_raises():
     with pytest.raises(ValueError, match="name a constant once"):
-        check_tolerances((Tolerance("r", 0.05), Tolerance("r", 0.1)), False)
+        validate_tolerances((Tolerance("r", 0.05), Tolerance("r", 0.1)), False)
     with pytest.raises(ValueError, match="name a constant once; got k, omega0"):
-        check_tolerances((Tolerance("k", 0.05), Tolerance("omega0", 0.1)), False)
+        validate_tolerances((Tolerance("k", 0.05), Tolerance("omega0", 0.1)), False)
 
 
-def test_another_name_of_a_constant_scatters_as_it_does():
+def test_factors_of_derived_names_scale_their_constants():
     device = Harvester(omega0=300.0)
-    made = scattered(device, ("k", "d"), (1.21, 0.9))
-    assert float(made.omega0) == pytest.approx(330.0, rel=1e-14)
-    assert float(made.k) == pytest.approx(1.21 * float(device.k), rel=1e-14)
-    assert float(made.pair().d) == pytest.approx(0.9 * float(device.pair().d), rel=1e-14)
+    scaled = with_factors(device, ("k", "d"), (1.21, 0.9))
+    assert float(scaled.omega0) == pytest.approx(330.0, rel=1e-14)
+    assert float(scaled.k) == pytest.approx(1.21 * float(device.k), rel=1e-14)
+    assert float(scaled.pair().d) == pytest.approx(0.9 * float(device.pair().d), rel=1e-14)

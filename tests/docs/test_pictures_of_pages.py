@@ -1,4 +1,4 @@
-"""The pictures that are kept: each is shown, and has one command that makes it."""
+"""The stored pictures: each is on a page, and has a command that makes it."""
 
 import re
 import shlex
@@ -10,22 +10,22 @@ import pytest
 from scripts import pictures
 from vijax.cli.main import vijax as command
 
-SHOWN_ON = [
+PAGES = [
     pictures.ROOT / "README.md",
     *(pictures.ROOT / "docs").glob("*.md"),
     *(pictures.ROOT / "docs/tutorials").glob("*.md"),
 ]
 
 
-def test_every_picture_has_a_command_and_is_shown():
-    kept = {path.stem for path in pictures.GALLERY.iterdir()}
-    pages = "\n".join(page.read_text(encoding="utf-8") for page in SHOWN_ON)
-    assert kept == set(pictures.PICTURES)
-    assert set(re.findall(r"scripts/gallery/(\w+)\.png", pages)) == kept
+def test_all_pictures_have_a_command_and_are_on_a_page():
+    stored = {path.stem for path in pictures.GALLERY.iterdir()}
+    pages = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    assert stored == set(pictures.PICTURES)
+    assert set(re.findall(r"scripts/gallery/(\w+)\.png", pages)) == stored
 
 
 @pytest.mark.parametrize("name", pictures.PICTURES)
-def test_every_command_is_one(name):
+def test_the_commands_of_pictures_are_valid(name):
     program, *arguments = shlex.split(pictures.PICTURES[name].format("picture.png"))
     if program != "-m":
         assert (pictures.ROOT / program).exists()
@@ -36,7 +36,7 @@ def test_every_command_is_one(name):
         assert (pictures.ROOT / arguments[0].replace(".", "/")).with_suffix(".py").exists()
 
 
-def test_a_picture_is_made_and_put_where_it_is_shown(tmp_path, monkeypatch):
+def test_a_picture_is_made_and_moved_into_the_gallery(tmp_path, monkeypatch):
     monkeypatch.setattr(pictures, "GALLERY", tmp_path)
     monkeypatch.setitem(
         pictures.PICTURES, "small", f"-c 'import shutil, sys; shutil.copy(*sys.argv[1:])' {__file__} {{}}"

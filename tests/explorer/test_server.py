@@ -1,4 +1,4 @@
-"""Who may ask the server, what it says where it cannot serve, and the page in a notebook."""
+"""Access to the server, its errors, and the page in a notebook."""
 
 import gc
 import os
@@ -16,13 +16,14 @@ from tornado.websocket import websocket_connect
 import vijax
 from tests.helpers import no_cell_runs
 from vijax.cli.main import main
-from vijax.explorer import door, request_filter, server, worker
+from vijax.explorer import explore
+from vijax.explorer.server import request_filter, server, worker
 from vijax.explorer.source import Source
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _at_once():
-    """Servers show a map whatever its cells do, so that no cell has to run."""
+def _without_cell_runs():
+    """Make maps without cell runs; servers do not depend on cell results."""
     with no_cell_runs():
         yield
 
@@ -34,50 +35,52 @@ def dataset():
 
 @pytest.fixture
 def serving(dataset, monkeypatch):
-    """Make servers of the map, none of which compiles ahead; give each, a page of it, and how to ask it."""
-    monkeypatch.setattr(server, "warm", lambda *_: None)
+    """Start servers without compilation in advance; return the server, its page, and a function for requests."""
+    monkeypatch.setattr(server, "precompile", lambda *_: None)
     made = []
 
     def serve(address, origins=()):
-        one, crew, page = server.serve(Source(dataset), address, 0, origins)
-        made.append((one, crew))
+        bokeh_server, threads, page = server.serve(Source(dataset), address, 0, origins)
+        made.append((bokeh_server, threads))
 
-        def ask(url, **further):
-            return one.io_loop.run_sync(lambda: AsyncHTTPClient().fetch(HTTPRequest(url, **further)), timeout=30)
+        def fetch(url, **further):
+            return bokeh_server.io_loop.run_sync(
+                lambda: AsyncHTTPClient().fetch(HTTPRequest(url, **further)), timeout=30
+            )
 
-        return one, page, ask
+        return bokeh_server, page, fetch
 
     yield serve
-    for one, crew in made:
-        one.stop()
-        crew.close()
+    for bokeh_server, threads in made:
+        bokeh_server.stop()
+        threads.close()
 
 
 def test_this_machine_alone_is_served_without_a_token(serving):
-    one, page, ask = serving("127.0.0.1")
-    assert page == f"http://127.0.0.1:{one.port}/"
-    body = ask(page).body.decode()
+    bokeh_server, page, fetch = serving("127.0.0.1")
+    assert page == f"http://127.0.0.1:{bokeh_server.port}/"
+    body = fetch(page).body.decode()
     assert 'id="map"' in body
     assert "https://" not in body.partition("<body>")[0].replace("https://github.com", "")
 
 
-def test_others_need_the_token_of_the_address(serving):
-    one, page, ask = serving("0.0.0.0", ("127.0.0.1:1",))
-    base, token = f"http://127.0.0.1:{one.port}/", page.partition("token=")[2]
+def test_other_machines_need_the_token_of_the_address(serving):
+    bokeh_server, page, fetch = serving("0.0.0.0", ("127.0.0.1:1",))
+    base, token = f"http://127.0.0.1:{bokeh_server.port}/", page.partition("token=")[2]
     assert len(token) > 20
     for wrong in ("", "?token=", "?token=guess"):
         with pytest.raises(HTTPClientError, match="403"):
-            ask(base + wrong)
-    answer = ask(f"{base}?token={token}")
+            fetch(base + wrong)
+    answer = fetch(f"{base}?token={token}")
     assert 'id="map"' in answer.body.decode()
     assert "HttpOnly" in answer.headers["Set-Cookie"]
 
 
-def test_a_page_from_elsewhere_may_not_ask(serving):
-    one, _, _ = serving("127.0.0.1")
-    asked = HTTPRequest(f"ws://127.0.0.1:{one.port}/ws", headers={"Origin": "http://elsewhere.example"})
+def test_connection_from_another_origin_is_refused(serving):
+    bokeh_server, _, _ = serving("127.0.0.1")
+    request = HTTPRequest(f"ws://127.0.0.1:{bokeh_server.port}/ws", headers={"Origin": "http://elsewhere.example"})
     with pytest.raises(HTTPClientError, match="403"):
-        one.io_loop.run_sync(lambda: websocket_connect(asked, subprotocols=["bokeh", "none"]), timeout=30)
+        bokeh_server.io_loop.run_sync(lambda: websocket_connect(request, subprotocols=["bokeh", "none"]), timeout=30)
 
 
 def sessions(server):
@@ -89,65 +92,65 @@ def sessions(server):
 )
 @pytest.mark.parametrize("path", ["", "ws", "autoload.js?bokeh-autoload-element=1", "static/js/bokeh.min.js"])
 def test_a_request_for_another_host_is_refused(serving, host, path):
-    """A foreign name that points to this machine: its pages could read what is answered."""
-    one, page, ask = serving("127.0.0.1")
+    """A foreign host name may resolve to this machine; its pages could read the answers."""
+    bokeh_server, page, fetch = serving("127.0.0.1")
     with pytest.raises(HTTPClientError, match="403") as refused:
-        ask(page + path, headers={"Host": host.format(port=one.port)})
+        fetch(page + path, headers={"Host": host.format(port=bokeh_server.port)})
     assert b"--allow-origin" in refused.value.response.body
-    assert not sessions(one)
+    assert not sessions(bokeh_server)
 
 
 @pytest.mark.parametrize("host", ["localhost:{port}", "LOCALHOST", "[::1]:{port}", "127.0.0.1:8000"])
-def test_this_machine_is_known_by_its_names(serving, host):
-    """By any port: a tunnel has another."""
-    one, page, ask = serving("127.0.0.1")
-    assert ask(page + "static/js/bokeh.min.js", headers={"Host": host.format(port=one.port)}).code == 200
+def test_names_of_this_machine_are_accepted(serving, host):
+    """All ports are accepted, since a tunnel has another port."""
+    bokeh_server, page, fetch = serving("127.0.0.1")
+    assert fetch(page + "static/js/bokeh.min.js", headers={"Host": host.format(port=bokeh_server.port)}).code == 200
 
 
-def test_a_host_that_is_allowed_is_answered(serving):
-    one, _, ask = serving("127.0.0.1", ("Lab.example.org:5006",))
-    assert ask(f"http://127.0.0.1:{one.port}/", headers={"Host": "lab.example.org"}).code == 200
+def test_allowed_host_is_answered(serving):
+    bokeh_server, _, fetch = serving("127.0.0.1", ("Lab.example.org:5006",))
+    assert fetch(f"http://127.0.0.1:{bokeh_server.port}/", headers={"Host": "lab.example.org"}).code == 200
 
 
-def connect(one, page, token):
-    """Connect to a session as the script of a page does."""
-    asked = HTTPRequest(page.replace("http:", "ws:") + "ws", headers={"Origin": page.rstrip("/")})
-    return one.io_loop.run_sync(lambda: websocket_connect(asked, subprotocols=["bokeh", token]), timeout=30)
+def connect(bokeh_server, page, token):
+    """Connect to a session like the script of a page."""
+    request = HTTPRequest(page.replace("http:", "ws:") + "ws", headers={"Origin": page.rstrip("/")})
+    return bokeh_server.io_loop.run_sync(lambda: websocket_connect(request, subprotocols=["bokeh", token]), timeout=30)
 
 
 @pytest.mark.parametrize("bound", ["MOST_SESSIONS", "MOST_WAITING"])
-def test_there_are_so_many_pages_at_most(serving, monkeypatch, bound):
+def test_number_of_pages_is_limited(serving, monkeypatch, bound):
     monkeypatch.setattr(request_filter, bound, 3)
-    one, page, ask = serving("127.0.0.1")
+    bokeh_server, page, fetch = serving("127.0.0.1")
     for _ in range(3):
-        ask(page)
+        fetch(page)
     for path in ("", "autoload.js?bokeh-autoload-element=1"):
         with pytest.raises(HTTPClientError, match="503") as refused:
-            ask(page + path)
+            fetch(page + path)
         assert b"load this page again in 12 seconds" in refused.value.response.body
-    assert len(sessions(one)) == 3
+    assert len(sessions(bokeh_server)) == 3
     for token in ("none", generate_jwt_token("another")):
         with pytest.raises(HTTPClientError, match="503"):
-            connect(one, page, token)
-    connection = connect(one, page, generate_jwt_token(min(sessions(one)), expiration=60))
-    one.io_loop.run_sync(connection.read_message)  # what a page is sent when it is connected
+            connect(bokeh_server, page, token)
+    connection = connect(bokeh_server, page, generate_jwt_token(min(sessions(bokeh_server)), expiration=60))
+    bokeh_server.io_loop.run_sync(connection.read_message)  # first message to a connected page
     if bound == "MOST_WAITING":
-        ask(page)
-        assert len(sessions(one)) == 4
+        fetch(page)
+        assert len(sessions(bokeh_server)) == 4
     connection.close()
 
 
-def test_the_end_of_a_page_collects_no_garbage(serving, monkeypatch):
-    """Only that of every so-many-th does: the collector looks at all objects of the process."""
-    monkeypatch.setattr(server, "COLLECTED", 3)
+def test_garbage_collection_runs_after_several_closed_pages(serving, monkeypatch):
+    """The collector runs once for several closed pages, since it scans all objects of the process."""
+    monkeypatch.setattr(server, "PAGES_PER_COLLECTION", 3)
     collected = []
     monkeypatch.setattr(gc, "collect", lambda *_: collected.append(1))
-    one, page, ask = serving("127.0.0.1")
+    bokeh_server, page, fetch = serving("127.0.0.1")
     for _ in range(4):
-        ask(page)
-    monkeypatch.setattr(one._tornado, "_unused_session_lifetime_milliseconds", -1)
-    one.io_loop.run_sync(one._tornado._cleanup_sessions)
-    assert not sessions(one)
+        fetch(page)
+    monkeypatch.setattr(bokeh_server._tornado, "_unused_session_lifetime_milliseconds", -1)
+    bokeh_server.io_loop.run_sync(bokeh_server._tornado._cleanup_sessions)
+    assert not sessions(bokeh_server)
     assert len(collected) == 1
 
 
@@ -164,27 +167,27 @@ def test_an_open_address_needs_an_origin(dataset):
         (0, "nowhere.invalid", "address must be one that this machine has; got nowhere.invalid"),
     ],
 )
-def test_where_no_server_can_listen_is_said_in_a_line(serving, dataset, port, address, must):
-    one, _, _ = serving("127.0.0.1")
-    port = port and one.port
+def test_unusable_address_or_port_raises(serving, dataset, port, address, must):
+    bokeh_server, _, _ = serving("127.0.0.1")
+    port = port and bokeh_server.port
     with pytest.raises(OSError, match=must.format(port=port)):
         server.serve(Source(dataset), address, port, ("lab:1",))
 
 
 @pytest.mark.parametrize("origin", ["*", "*:5006", "http://lab", "lab/", "lab:99999", ""])
-def test_an_origin_is_one_machine(dataset, origin):
+def test_invalid_origin_raises(dataset, origin):
     with pytest.raises(ValueError, match="allow_origin must be HOST or HOST:PORT"):
         server.serve(Source(dataset), "0.0.0.0", 0, (origin,))
 
 
-def test_what_a_damaged_store_says_is_text(serving, monkeypatch):
-    _, page, ask = serving("127.0.0.1")
+def test_error_of_a_damaged_store_is_escaped(serving, monkeypatch):
+    _, page, fetch = serving("127.0.0.1")
 
     def broken(self):
         raise ValueError("<script>alert(1)</script>")
 
     monkeypatch.setattr(Source, "plane", broken)
-    body = ask(page).body.decode()
+    body = fetch(page).body.decode()
     assert "&lt;script&gt;alert(1)" in body
     assert "<script>alert(1)" not in body
 
@@ -198,7 +201,7 @@ def test_what_a_damaged_store_says_is_text(serving, monkeypatch):
         (OSError("gone"), "gone"),
     ],
 )
-def test_a_store_that_cannot_be_read_is_one_line(monkeypatch, capsys, error, line):
+def test_unreadable_store_prints_a_line(monkeypatch, capsys, error, line):
     def fail(path):
         raise error
 
@@ -208,8 +211,8 @@ def test_a_store_that_cannot_be_read_is_one_line(monkeypatch, capsys, error, lin
 
 
 @pytest.mark.parametrize("sizes", [(1, 1), (0, 0), (0, 4), (1, 4), (60_000, 60_000)])
-def test_a_map_that_cannot_be_shown_is_one_line(sizes):
-    """Of which no value is read."""
+def test_unsuitable_map_raises_before_values_are_read(sizes):
+    """The check uses the sizes of the map and reads no value."""
     axes = {name: (name, np.zeros(1).repeat(size)) for name, size in zip(("d", "kappa"), sizes, strict=True)}
     values = np.broadcast_to(np.int8(0), sizes)
     with pytest.raises(ValueError, match=r"^source: dataset must have (two axes of|at most 67,108,864 cells)"):
@@ -217,14 +220,14 @@ def test_a_map_that_cannot_be_shown_is_one_line(sizes):
 
 
 def test_without_bokeh_the_extra_is_named(monkeypatch):
-    monkeypatch.setattr(door, "find_spec", lambda name: None)
+    monkeypatch.setattr(explore, "find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'vijax\[explore\]'"):
         vijax.explore(browser=False)
 
 
 def test_a_store_is_read_again_when_a_tile_is_done(tmp_path):
     store = tmp_path / "plane.zarr"
-    whole = vijax.sweep(d=np.linspace(0.1, 0.3, 4), kappa=np.geomspace(3, 400, 4), out=store)
+    expected = vijax.sweep(d=np.linspace(0.1, 0.3, 4), kappa=np.geomspace(3, 400, 4), out=store)
     source = Source(store)
     first = source.plane()
     assert source.plane() is first
@@ -232,11 +235,11 @@ def test_a_store_is_read_again_when_a_tile_is_done(tmp_path):
     later = time.time_ns() + 10**9
     os.utime(record, ns=(later, later))
     assert source.plane() is not first
-    assert (source.plane().dataset["P"].values == whole["P"].values).all()
+    assert (source.plane().dataset["P"].values == expected["P"].values).all()
 
 
-def test_a_process_that_is_cancelled_ends_and_the_next_work_has_another():
-    one, ticks = worker.Worker(), []
+def test_cancelled_process_ends_and_the_next_job_has_a_new_process():
+    process_worker, ticks = worker.Worker(), []
 
     def until_third(done, total):
         ticks.append(done)
@@ -244,28 +247,28 @@ def test_a_process_that_is_cancelled_ends_and_the_next_work_has_another():
             raise KeyError("cancelled")
 
     with pytest.raises(KeyError):
-        one.run(time.sleep, (60,), until_third)
-    assert one._process is None
-    assert one.run(divmod, (7, 2), lambda done, total: None) == (3, 1)
+        process_worker.run(time.sleep, (60,), until_third)
+    assert process_worker._process is None
+    assert process_worker.run(divmod, (7, 2), lambda done, total: None) == (3, 1)
     # Ctrl-C reaches all processes of a group, and the server ends this one.
-    assert one.run(os.getpgrp, (), lambda done, total: None) != os.getpgrp()
+    assert process_worker.run(os.getpgrp, (), lambda done, total: None) != os.getpgrp()
     with pytest.raises(worker.WorkerError, match="division"):
-        one.run(divmod, (7, 0), lambda done, total: None)
-    one.close()
+        process_worker.run(divmod, (7, 0), lambda done, total: None)
+    process_worker.close()
 
 
 @pytest.mark.long
 def test_a_notebook_shows_the_page_in_a_frame(dataset, tmp_path):
     vijax.save(dataset, tmp_path / "plane.zarr")
     code = f"import vijax\nds = vijax.load({str(tmp_path / 'plane.zarr')!r})\nvijax.explore(ds, port=0)"
-    ask = (
+    request_code = (
         "from tornado.httpclient import AsyncHTTPClient\n"
         "from vijax.explorer import notebook\n"
-        "address = f'http://127.0.0.1:{notebook._KEPT[0][0].port}/'\n"
+        "address = f'http://127.0.0.1:{notebook._SERVERS[0][0].port}/'\n"
         "b'id=\"map\"' in (await AsyncHTTPClient().fetch(address)).body"
     )
-    book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(one) for one in (code, ask)])
+    book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(item) for item in (code, request_code)])
     NotebookClient(book, timeout=120, kernel_name="python3").execute()
-    (frame,) = (one for one in book.cells[0].outputs if "text/html" in one.get("data", {}))
+    (frame,) = (item for item in book.cells[0].outputs if "text/html" in item.get("data", {}))
     assert "<iframe" in frame["data"]["text/html"]
     assert book.cells[1].outputs[0]["data"]["text/plain"] == "True"

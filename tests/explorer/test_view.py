@@ -1,4 +1,4 @@
-"""What a page shows stands in its address, within bounds; what a cell is follows from the map; recipes say it again."""
+"""The address of a page contains its view within bounds, cells follow from the map, and recipes reproduce them."""
 
 import shlex
 from urllib.parse import parse_qsl
@@ -9,8 +9,9 @@ import pytest
 import vijax
 from tests.helpers import no_cell_runs
 from vijax.cli.main import main
-from vijax.explorer import answers, recipes, view
-from vijax.explorer.branch import CellBranch
+from vijax.explorer import view
+from vijax.explorer.analyses import recipes, results
+from vijax.explorer.analyses.branch import CellBranch
 from vijax.explorer.plane import cell, explored
 from vijax.explorer.view import View
 
@@ -18,7 +19,7 @@ COORDINATES = ("d", "kappa", "r", "gamma", "u0", "v0")
 
 
 def unrun(**axes):
-    """Make a map without running it: what a cell is does not depend on what it does."""
+    """Return a map without cell runs; the definition of a cell does not depend on its results."""
     with no_cell_runs():
         return vijax.sweep(**axes)
 
@@ -36,20 +37,22 @@ def plane(power):
 
 @pytest.fixture(scope="module")
 def physical():
-    """A map over quantities of the device, of which the nondimensional ones all vary."""
+    """Map over quantities of the device in which all nondimensional quantities vary."""
     omega, device = np.pi * np.array([1.0, 4.0, 9.0]), vijax.Harvester(V=1500.0)
     return unrun(omega=omega, omega0=[40.0, 400.0], A=[1.0, 2.0], s=0.2, beta=0.1, device=device)
 
 
 def test_a_view_is_restored_by_its_address(plane):
-    shown = View("label", "log", (3, 1), {"r": 0.43210987654321, "v0": -0.25}, "d", ("branch",), True)
-    assert view.from_query(plane, dict(parse_qsl(view.query(shown)))) == shown
+    page_view = View("label", "log", (3, 1), {"r": 0.43210987654321, "v0": -0.25}, "d", ("branch",), True)
+    assert view.from_query(plane, dict(parse_qsl(view.query(page_view)))) == page_view
 
 
-def test_an_address_without_a_query_opens_on_the_best_cell_that_is_admissible(power):
-    some = power.assign(admissible=(power["kappa"] < 100) & (power["P"] > 0))
-    column, row = view.from_query(explored(some), {}).pick
-    assert some["P"].isel(d=column, kappa=row) == some["P"].where(some["admissible"]).max() < some["P"].max()
+def test_default_pick_is_the_best_admissible_cell(power):
+    dataset = power.assign(admissible=(power["kappa"] < 100) & (power["P"] > 0))
+    column, row = view.from_query(explored(dataset), {}).pick
+    assert (
+        dataset["P"].isel(d=column, kappa=row) == dataset["P"].where(dataset["admissible"]).max() < dataset["P"].max()
+    )
 
 
 @pytest.mark.parametrize(
@@ -68,30 +71,33 @@ def test_an_address_without_a_query_opens_on_the_best_cell_that_is_admissible(po
         ("beta", "0.1"),
     ],
 )
-def test_what_an_address_cannot_say_is_refused_in_a_line(plane, name, text):
+def test_invalid_address_raises(plane, name, text):
     with pytest.raises(ValueError, match="must"):
         view.from_query(plane, {name: text})
 
 
-def test_every_cell_is_that_of_the_map(power, physical):
+def test_cells_agree_with_the_map(power, physical):
     for dataset in (power, physical):
         plane = explored(dataset)
         (x, y), pick = (plane.x.name, plane.y.name), (1, 1)
-        own = dataset.isel({x: 1, y: 1} | dict.fromkeys(plane.further, 0))
-        found = cell(plane, pick, {})
-        got = {name: float(getattr(found.pair, name)) for name in COORDINATES[:4]} | {"u0": found.u0, "v0": found.v0}
-        assert got == pytest.approx({name: float(own[name]) for name in COORDINATES}, rel=1e-14)
-        again = unrun(device=found.device, **found.settings, **found.arguments)
-        assert float(found.device.V) == dataset.attrs["harvester_V"]
-        assert float(again["P"]) == pytest.approx(float(own["P"]), rel=1e-12)
+        map_cell = dataset.isel({x: 1, y: 1} | dict.fromkeys(plane.further, 0))
+        picked = cell(plane, pick, {})
+        actual = {name: float(getattr(picked.pair, name)) for name in COORDINATES[:4]} | {
+            "u0": picked.u0,
+            "v0": picked.v0,
+        }
+        assert actual == pytest.approx({name: float(map_cell[name]) for name in COORDINATES}, rel=1e-14)
+        again = unrun(device=picked.device, **picked.settings, **picked.arguments)
+        assert float(picked.device.V) == dataset.attrs["harvester_V"]
+        assert float(again["P"]) == pytest.approx(float(map_cell["P"]), rel=1e-12)
 
 
-def test_a_further_axis_and_what_is_fixed_can_be_moved(physical):
+def test_further_axes_and_fixed_quantities_can_change(physical):
     plane = explored(physical)
     assert set(plane.fixed) == {"s", "r", "beta"}
     assert set(view.bounds(plane)) == {"s", "r", "beta", "u0", "v0", "A"}
-    found = cell(plane, (0, 1), {"A": 2.0, "s": 0.1})
-    assert float(found.pair.d) == pytest.approx(0.1 / (2.0 * np.pi**2) * np.pi**2)
+    picked = cell(plane, (0, 1), {"A": 2.0, "s": 0.1})
+    assert float(picked.pair.d) == pytest.approx(0.1 / (2.0 * np.pi**2) * np.pi**2)
     assert plane.slices({"A": 2.0}) == {"A": 1}
     assert plane.differs({"A": 2.0}) == ()
     assert plane.differs({"s": 0.1}) == ("s",)
@@ -109,13 +115,13 @@ def test_a_further_axis_and_what_is_fixed_can_be_moved(physical):
         (lambda power: 3, "dataset must be"),
     ],
 )
-def test_what_cannot_be_looked_into_is_said_at_the_door(power, changed, must):
+def test_unsuitable_datasets_raise(power, changed, must):
     with pytest.raises(ValueError, match=must):
         explored(changed(power))
 
 
 @pytest.mark.parametrize(
-    ("ends", "said"),
+    ("ends", "sentence"),
     [
         (("low", "high"), "it ends at the low end of the range and at the high end of the range."),
         (("high", "high"), "it ends at the high end of the range, either way."),
@@ -123,37 +129,37 @@ def test_what_cannot_be_looked_into_is_said_at_the_door(power, changed, must):
         (("grazing flight", "points"), "it ends at a grazing flight and after 600 orbits."),
     ],
 )
-def test_how_a_branch_ends_is_a_sentence(ends, said):
-    met = (("fold", 0.2, 0.1), ("fold", 0.2, 0.3), ("flip", 0.1, 0.1))
-    found = CellBranch("kappa", (), met, ends, None)
-    assert answers.branch_text(found) == f"The branch has folds at \u03ba = 0.2; {said}"
-    assert answers.branch_rows(found) == [["met", "\u03ba"], ["flip", "0.1"], ["fold", "0.2"]]
+def test_ends_of_a_branch_are_a_sentence(ends, sentence):
+    events = (("fold", 0.2, 0.1), ("fold", 0.2, 0.3), ("flip", 0.1, 0.1))
+    cell_branch = CellBranch("kappa", (), events, ends, None)
+    assert results.branch_text(cell_branch) == f"The branch has folds at \u03ba = 0.2; {sentence}"
+    assert results.branch_rows(cell_branch) == [["event", "\u03ba"], ["flip", "0.1"], ["fold", "0.2"]]
 
 
 @pytest.mark.long
-def test_the_lines_to_copy_give_what_the_page_shows(physical, tmp_path, capsys, monkeypatch):
-    from vijax.explorer.motion import motion
+def test_recipe_reproduces_the_panel_of_a_motion(physical, tmp_path, capsys, monkeypatch):
+    from vijax.explorer.analyses.motion import motion
 
     monkeypatch.chdir(tmp_path)
     plane = explored(physical)
-    found = cell(plane, (1, 1), {"r": 0.6})
-    moved = motion(found)
-    recipe = recipes.of_motion(found, moved)
-    made: dict = {}
-    exec(recipe.python, made)
-    assert float(made["found"]["P"]) == moved.numbers["P"]
-    assert (float(made["end"].u_strobe), float(made["end"].v_strobe)) == moved.end
-    flown = vijax.trajectory(found.pair, found.u0, found.v0, periods=400).states
-    assert moved.end == pytest.approx((float(flown.u[-1]), float(flown.v[-1])), abs=1e-9)
+    picked = cell(plane, (1, 1), {"r": 0.6})
+    moved = motion(picked)
+    recipe = recipes.of_motion(picked, moved)
+    namespace: dict = {}
+    exec(recipe.python, namespace)
+    assert float(namespace["result"]["P"]) == moved.numbers["P"]
+    assert (float(namespace["end"].u_strobe), float(namespace["end"].v_strobe)) == moved.end
+    states = vijax.trajectory(picked.pair, picked.u0, picked.v0, periods=400).states
+    assert moved.end == pytest.approx((float(states.u[-1]), float(states.v[-1])), abs=1e-9)
     if moved.orbit is not None:
-        assert np.array_equal(np.asarray(made["orbit"].multipliers), np.asarray(moved.orbit.multipliers))
-    rows = dict(answers.cell_rows(found, moved))
-    assert rows["P"].startswith(f"{float(made['found']['P']):.6g} J per half period")
-    assert rows["power"] == f"{float(made['found']['power']):.6g} W"
-    assert rows["penetration"].startswith(f"{1e3 * float(made['found']['max_penetration']):.6g} mm (limit 6.3 mm)")
+        assert np.array_equal(np.asarray(namespace["orbit"].multipliers), np.asarray(moved.orbit.multipliers))
+    rows = dict(results.cell_rows(picked, moved))
+    assert rows["P"].startswith(f"{float(namespace['found']['P']):.6g} J per half period")
+    assert rows["power"] == f"{float(namespace['found']['power']):.6g} W"
+    assert rows["penetration"].startswith(f"{1e3 * float(namespace['found']['max_penetration']):.6g} mm (limit 6.3 mm)")
     assert rows["label"] == moved.name
     if moved.orbit is not None:
-        first = complex(np.asarray(made["orbit"].multipliers)[0, 0])
+        first = complex(np.asarray(namespace["orbit"].multipliers)[0, 0])
         assert rows["multipliers"].startswith(f"{first.real:.6g}")
     assert main([*shlex.split(recipe.command)[1:], "--out", "cell.zarr"]) == 0
     assert f"{moved.numbers['P']:.6g}" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Harvested energy and the energy given to the membrane, against geometry, quadrature and 50-digit orbits."""
+"""Harvested energy and membrane work, against geometry, quadrature and 50-digit orbits."""
 
 import dataclasses
 import functools
@@ -26,7 +26,7 @@ from vijax.model.energy import (
 from vijax.model.pair import impact_pair
 
 DATA = Path(__file__).parents[1] / "data"
-DEVICE = Harvester()  # one unit of u is a metre, one of u' a metre per second
+DEVICE = Harvester()  # one unit of u is a metre, one unit of u' a metre per second
 ORBITS = json.loads((DATA / "gradients.json").read_text())["orbits"]
 
 
@@ -34,7 +34,7 @@ ORBITS = json.loads((DATA / "gradients.json").read_text())["orbits"]
 
 
 def test_area_is_a_cap_and_a_tangent_cone():
-    """The shape itself, by tangency in 40 digits: the generating line from the rim touches the ball at angle alpha."""
+    """The shape by tangency in 40 digits: the generating line from the rim touches the ball at angle alpha."""
     rim, ball = mp.mpf(DEVICE.R0), mp.mpf(DEVICE.r_b)
     for depth in (1e-12, 1e-9, 1e-6, 1e-4, 1e-3, 3e-3, 0.005, 0.0063, 0.02, 0.3):
         with mp.workdps(60):
@@ -44,8 +44,8 @@ def test_area_is_a_cap_and_a_tangent_cone():
                 return (rim - ball * mp.sin(alpha)) * mp.sin(alpha) - (ball * mp.cos(alpha) - height) * mp.cos(alpha)
 
             alpha = mp.findroot(off_tangent, (mp.mpf(0), mp.pi / 2), solver="anderson", tol=1e-100)
-            touch = ball * mp.sin(alpha)
-            cone = mp.pi * (rim + touch) * mp.hypot(rim - touch, ball * mp.cos(alpha) - height)
+            contact_radius = ball * mp.sin(alpha)
+            cone = mp.pi * (rim + contact_radius) * mp.hypot(rim - contact_radius, ball * mp.cos(alpha) - height)
             cap = 2 * mp.pi * ball**2 * (1 - mp.cos(alpha))
             expected = (cap + cone) / (mp.pi * rim**2) - 1
         assert float(stretch(DEVICE, depth)) == pytest.approx(float(expected), rel=5e-15, abs=0), depth
@@ -69,7 +69,7 @@ def test_corrected_area_of_the_misprint_study(depth, area):
 
 def test_area_is_continuous_at_no_depth():
     assert float(stretch(DEVICE, 0.0)) == 0 == float(stretch(DEVICE, -1.0))
-    # Quadratic from there: x^2/2 in units of R0, and no step as with the printed r_b cos(alpha).
+    # Near depth 0 the area is quadratic, x^2/2 in units of R0, without the step of the printed r_b cos(alpha).
     x = 1e-9
     assert float(stretch(DEVICE, x * DEVICE.R0)) == pytest.approx(x * x / 2, rel=1e-8, abs=0)
     assert math.isnan(float(harvested_energy(DEVICE, math.nan)))
@@ -80,28 +80,31 @@ def test_area_is_continuous_at_no_depth():
 
 @pytest.mark.parametrize("orbit", ORBITS, ids=[f"d{o['d']}-kappa{o['kappa']}" for o in ORBITS])
 def test_energy_of_fifty_digit_orbits(orbit):
-    """A 1:1 orbit has P = the mean of its two E_j."""
+    """P of a 1:1 orbit is the mean of its two E_j."""
     energies = harvested_energy(DEVICE, jnp.array([float(x) for x in orbit["dmax"]]))
     assert float(energies.mean()) == pytest.approx(float(orbit["P_J"]), rel=3e-15, abs=0)
 
 
 @pytest.mark.parametrize(("d", "microjoule"), [(0.187, 1.12), (0.2, 1.18), (0.3, 1.68)])
 def test_rigid_orbit_yields_microjoules(d, microjoule):
-    """The 1:1 orbit of the rigid wall from its four equations, its energy with Table II's kappa = 400 and r = 0.5.
+    """The 1:1 orbit of the rigid wall from its four equations has the energy for kappa = 400 and r = 0.5 of Table II.
 
-    Below d = 0.2634 the stable one is asymmetric in phase; its two speeds are equal all the same.
+    Below d = 0.2634 the stable orbit is asymmetric in phase, but its two speeds are equal.
     """
     r = 0.5
 
-    def orbit(right, ahead, v_right, v_left):
-        """Right wall at phase `right`, left wall a time `ahead` later: two flights that must close."""
-        left = right + ahead
-        slope, bend = mp.sinpi(left) - mp.sinpi(right), (mp.cospi(left) - mp.cospi(right)) / mp.pi**2
+    def orbit(phase_right, ahead, speed_right, speed_left):
+        """Return residuals of two flights: right wall at phase `phase_right`, left wall a time `ahead` later."""
+        phase_left = phase_right + ahead
+        slope, bend = (
+            mp.sinpi(phase_left) - mp.sinpi(phase_right),
+            (mp.cospi(phase_left) - mp.cospi(phase_right)) / mp.pi**2,
+        )
         return (
-            v_left - r * v_right + slope / mp.pi,
-            v_right - r * v_left + slope / mp.pi,
-            d - (r * v_right + mp.sinpi(right) / mp.pi) * ahead - bend,
-            d - (r * v_left - mp.sinpi(left) / mp.pi) * (2 - ahead) - bend,
+            speed_left - r * speed_right + slope / mp.pi,
+            speed_right - r * speed_left + slope / mp.pi,
+            d - (r * speed_right + mp.sinpi(phase_right) / mp.pi) * ahead - bend,
+            d - (r * speed_left - mp.sinpi(phase_left) / mp.pi) * (2 - ahead) - bend,
         )
 
     _, _, *speeds = mp.findroot(orbit, (0.3, 0.7, 0.52, 0.49))
@@ -109,7 +112,7 @@ def test_rigid_orbit_yields_microjoules(d, microjoule):
     assert float(harvested_energy(DEVICE, depths).mean()) * 1e6 == pytest.approx(microjoule, abs=0.005)
 
 
-def test_energy_of_shallow_impacts_keeps_its_digits():
+def test_energy_of_shallow_impacts_is_exact_to_rounding():
     for depth in 10.0 ** np.arange(-15, -3):
         with mp.workdps(80):
             x, ball, rim = mp.mpf(depth), mp.mpf(DEVICE.r_b), mp.mpf(DEVICE.R0)
@@ -149,15 +152,15 @@ def test_rigid_penetration_is_the_depth_of_a_free_contact():
             expected = mp.exp(-zeta * deepest) * mp.sin(omega1 * deepest) / omega1
         assert float(rigid_penetration(pair.r)) == pytest.approx(float(expected), rel=1e-14, abs=0)
     assert float(rigid_penetration(1.0)) == 1
-    # d chi/dr at r = 1 by hand: chi = exp(-D atan2(pi, D)/pi) with D = -ln r, so chi' = 1/2.
+    # d chi/dr at r = 1, derived by hand: chi = exp(-D atan2(pi, D)/pi) with D = -ln r, so chi' = 1/2.
     assert float(jax.grad(rigid_penetration)(1.0)) == pytest.approx(0.5, rel=1e-15, abs=0)
 
 
-# --- energy given to the membrane ------------------------------------------------------------------------------------
+# --- work on the membrane --------------------------------------------------------------------------------------------
 
 
 def contact(kappa, mu, gamma, side, t_in, v_in):
-    """Penetration and its rate over elapsed time, in mpmath's digits, from the closed form of physics.md."""
+    """Return penetration and rate as functions of elapsed time in mpmath's digits, by the closed form of physics.md."""
     kappa, mu, gamma, t_in, v_in = (mp.mpf(x) for x in (kappa, mu, gamma, t_in, v_in))
     side, zeta = int(side), mu / 2
     omega1 = mp.sqrt(kappa**2 - zeta**2)
@@ -178,25 +181,25 @@ def contact(kappa, mu, gamma, side, t_in, v_in):
     return depth, rate
 
 
-def exit_time(depth, first, stride):
-    """A zero of the depth after onset: any will do, as W is defined between two zeros."""
+def exit_time(depth, first, step):
+    """Return a zero of the depth after onset; any zero is valid, because W is defined between two zeros."""
     low, high = first / 2, first
     while depth(high) > 0:
-        low, high = high, high + stride
+        low, high = high, high + step
         if high > 8:
             return None
     return mp.findroot(depth, (mp.mpf(low), mp.mpf(high)), solver="anderson", tol=1e-70, maxsteps=100)
 
 
 def cases(regime, count):
-    """(kappa, r, gamma, side, t_in, v_in) drawn for a regime of contacts."""
+    """Return random (kappa, r, gamma, side, t_in, v_in) of a regime of contacts."""
     rng = np.random.default_rng(sum(map(ord, regime)))
     for _ in range(count):
         kappa, r = 10 ** rng.uniform(-0.3, 1.5), rng.uniform(0.02, 0.98)
         side, t_in, gamma, speed = rng.choice([-1, 1]), rng.uniform(0, 2), rng.uniform(-1.5, 1.5), rng.uniform(0.05, 1)
         if regime == "stiff":
             kappa = 10 ** rng.uniform(2, 5)
-        if regime == "slow":  # thrown back by the forcing long before the spring acts
+        if regime == "slow":  # the forcing repels the ball long before the spring acts
             speed, gamma = 10 ** rng.uniform(-9, -2), side * rng.uniform(1.2, 2)
         if regime in ("resonant", "resonant elastic"):
             kappa = math.pi * (1 + rng.choice([-1, 1]) * 10 ** rng.uniform(-9, -2))
@@ -207,7 +210,7 @@ def cases(regime, count):
 
 @functools.cache
 def measured(regime, count):
-    """Arguments of `membrane_work` and W by quadrature, over the contacts of a regime."""
+    """Return arguments of `membrane_work` and W by quadrature, for the contacts of a regime."""
     rows, works = [], []
     with mp.workdps(40):
         for kappa, r, gamma, side, t_in, v_in in cases(regime, count):
@@ -222,12 +225,12 @@ def measured(regime, count):
             works.append(float(mp.mpf(mu) * mp.quad(lambda s, rate=rate: rate(s) ** 2, ends)))
             rows.append((kappa, mu, gamma, side, t_in, float(duration), v_in, float(side * rate(duration))))
     arguments, expected = np.array(rows).T, np.array(works)
-    arguments.flags.writeable = expected.flags.writeable = False  # shared by every test through the cache
+    arguments.flags.writeable = expected.flags.writeable = False  # shared by all tests through the cache
     return arguments, expected
 
 
-# Worst of 150 contacts of each regime: 1.5e-13, 1.8e-15, 1.9e-14, 2.0e-11, 6.9e-12, 1.8e-7. The last two groups lose
-# digits as eps (kappa/mu)^2 near kappa = pi, "elastic" as eps kappa/mu; r = 1 - 1e-4 is their far end.
+# Largest errors of 150 contacts of each regime: 1.5e-13, 1.8e-15, 1.9e-14, 2.0e-11, 6.9e-12, 1.8e-7. The last two
+# regimes lose digits: eps (kappa/mu)^2 near kappa = pi, and eps kappa/mu for "elastic", at most at r = 1 - 1e-4.
 @pytest.mark.parametrize(
     ("regime", "tolerance"),
     [
@@ -248,7 +251,7 @@ def test_membrane_work_against_quadrature(regime, tolerance):
 
 
 def test_membrane_work_of_reference_trajectories():
-    """Real contacts, soft to stiff, inclined too: W and the energy balance agree with quadrature."""
+    """Exact contacts, soft to stiff, also inclined: W and the energy balance agree with quadrature."""
     for entry in json.loads((DATA / "trajectories.json").read_text())["cases"]:
         case = entry["case"]
         if case.get("hard"):
@@ -259,15 +262,17 @@ def test_membrane_work_of_reference_trajectories():
             with mp.workdps(30):
                 _, rate = contact(case["kappa"], mu, case["gamma"], impact["side"], t, v_in)
                 expected = mu * mp.quad(lambda s, rate=rate: rate(s) ** 2, [0, duration / 2, duration])
-            given = (case["kappa"], mu, case["gamma"], impact["side"], t, duration, v_in, v_out)
-            assert float(membrane_work(*map(jnp.asarray, given))) == pytest.approx(float(expected), rel=1e-12, abs=0)
+            arguments = (case["kappa"], mu, case["gamma"], impact["side"], t, duration, v_in, v_out)
+            assert float(membrane_work(*map(jnp.asarray, arguments))) == pytest.approx(
+                float(expected), rel=1e-12, abs=0
+            )
 
 
-def test_forcing_moves_restitution_away_from_r():
-    """Calibrated without forcing, a stiff membrane gives back r nearly, a soft one up to twice as much."""
+def test_forcing_changes_the_restitution():
+    """Calibrated without forcing, a stiff membrane has a restitution of nearly r, a soft membrane of up to twice r."""
     departures = {}
     for entry in json.loads((DATA / "trajectories.json").read_text())["cases"]:
-        case, gone = entry["case"], []
+        case, differences = entry["case"], []
         if case.get("hard") or case["r"] != 0.5:
             continue
         mu = float(impact_pair(case["d"], case["kappa"], case["r"]).mu)
@@ -277,14 +282,14 @@ def test_forcing_moves_restitution_away_from_r():
             )
             v_out = impact["side"] * rate(mp.mpf(impact["tc"]))
             assert float(v_out) == pytest.approx(float(impact["vout"]), rel=1e-12, abs=0)
-            gone.append(abs(-v_out / mp.mpf(impact["vin"]) - case["r"]))
-        departures[case["kappa"]] = max(gone)
+            differences.append(abs(-v_out / mp.mpf(impact["vin"]) - case["r"]))
+        departures[case["kappa"]] = max(differences)
     assert departures[4] > 0.4
     assert 0.05 > departures[40] > departures[400] > 1e-3
 
 
 def test_membrane_work_tends_to_the_rigid_wall():
-    """The drawn r, not the -v_out/v_in of the contact: the departure is of order 1/(kappa v)."""
+    """The wall has the calibrated r, not -v_out/v_in of the contact: the difference is of order 1/(kappa v)."""
     (kappa, mu, *_, v_in, _), soft = measured("stiff", 12)
     decrement = math.pi * mu / np.sqrt(4 * kappa**2 - mu**2)
     rigid = membrane_work_rigid(v_in, np.exp(-decrement))
@@ -292,19 +297,21 @@ def test_membrane_work_tends_to_the_rigid_wall():
     assert float(membrane_work_rigid(-2.0, 0.5)) == 1.5
 
 
-def test_membrane_work_sees_mirror_images_alike():
+def test_membrane_work_of_mirror_images_is_equal():
     arguments, _ = measured("ordinary", 12)
     kappa, mu, gamma, side, t_in, duration, v_in, v_out = map(jnp.asarray, arguments)
     mirrored = membrane_work(kappa, mu, -gamma, -side, t_in + 1, duration, -v_in, -v_out)
     np.testing.assert_allclose(mirrored, membrane_work(*map(jnp.asarray, arguments)), rtol=1e-12)
 
 
-def test_elastic_membrane_takes_nothing():
+def test_an_elastic_membrane_receives_no_work():
     kappa, _, gamma, side, t_in, _, v_in, _ = measured("ordinary", 12)[0].copy()
-    kappa[0] = math.pi  # the undamped resonance, where the closed form has no meaning
-    given = [jnp.asarray(x) for x in (kappa, 0 * kappa, gamma, side, t_in, np.full_like(kappa, 0.7), v_in, -0.9 * v_in)]
-    np.testing.assert_array_equal(membrane_work(*given), 0)
-    assert np.all(np.isfinite(jax.vmap(jax.grad(membrane_work, argnums=(0, 1, 2, 4, 5, 6, 7)))(*given)))
+    kappa[0] = math.pi  # the undamped resonance, where the closed form is undefined
+    arguments = [
+        jnp.asarray(x) for x in (kappa, 0 * kappa, gamma, side, t_in, np.full_like(kappa, 0.7), v_in, -0.9 * v_in)
+    ]
+    np.testing.assert_array_equal(membrane_work(*arguments), 0)
+    assert np.all(np.isfinite(jax.vmap(jax.grad(membrane_work, argnums=(0, 1, 2, 4, 5, 6, 7)))(*arguments)))
     assert float(membrane_work_rigid(0.8, 1.0)) == 0
     energy = harvested_energy(DEVICE, jnp.array([1e-12, 1e-6, 1e-3]))
     assert not np.any(admissible(DEVICE, energy, jnp.zeros(3), 1e-6))
@@ -313,13 +320,13 @@ def test_elastic_membrane_takes_nothing():
 
 @pytest.mark.parametrize("regime", ["ordinary", "slow", "elastic"])
 def test_membrane_work_gradients(regime):
-    """Along each parameter of exact contacts: the partial derivatives, chained through duration and exit speed."""
+    """Derivatives by each parameter of exact contacts: partial derivatives, chained through duration and exit speed."""
 
-    def outcome(given, near):
-        depth, rate = contact(*given)
+    def outcome(arguments, near):
+        depth, rate = contact(*arguments)
         duration = mp.findroot(depth, (near, near * (1 + 1e-9)))
-        ends = mp.linspace(0, duration, 2 + int(given[0] * duration / 4))
-        return duration, given[3] * rate(duration), given[1] * mp.quad(lambda s: rate(s) ** 2, ends)
+        ends = mp.linspace(0, duration, 2 + int(arguments[0] * duration / 4))
+        return duration, arguments[3] * rate(duration), arguments[1] * mp.quad(lambda s: rate(s) ** 2, ends)
 
     gradient = jax.jit(jax.grad(membrane_work, argnums=(0, 1, 2, 4, 5, 6, 7)))
     rows, _ = measured(regime, 12)
@@ -328,15 +335,15 @@ def test_membrane_work_gradients(regime):
         by_duration, by_v_out = float(partial[4]), float(partial[6])
         with mp.workdps(40):
             for place, slope in zip((0, 1, 2, 4, 5), (*partial[:4], partial[5]), strict=True):
-                given = [kappa, mu, gamma, side, t_in, v_in]
-                step = mp.mpf("1e-10") * abs(given[place])
+                arguments = [kappa, mu, gamma, side, t_in, v_in]
+                step = mp.mpf("1e-10") * abs(arguments[place])
                 above, below = (
-                    outcome([x + sign * step if i == place else mp.mpf(x) for i, x in enumerate(given)], duration)
+                    outcome([x + sign * step if i == place else mp.mpf(x) for i, x in enumerate(arguments)], duration)
                     for sign in (1, -1)
                 )
                 longer, faster, work = ((a - b) / (2 * step) for a, b in zip(above, below, strict=True))
                 parts = [float(slope), by_duration * float(longer), by_v_out * float(faster)]
-                # The parts may cancel: what is left carries the error of the largest.
+                # The terms may cancel: the sum has the error of the largest term.
                 assert sum(parts) == pytest.approx(float(work), abs=1e-9 * max(map(abs, parts))), (regime, place)
 
 
@@ -344,8 +351,8 @@ def test_membrane_work_gradients(regime):
 
 
 @pytest.mark.parametrize("orbit", ORBITS, ids=[f"d{o['d']}-kappa{o['kappa']}" for o in ORBITS])
-def test_formula_outruns_the_membrane_on_soft_walls(orbit):
-    """Below kappa of about 35 the formula's energy passes what the membrane got; depth has a limit of its own."""
+def test_the_formula_exceeds_the_work_on_soft_walls(orbit):
+    """At kappa below about 35 the formula's energy exceeds the work on the membrane; the depth has a separate limit."""
     kappa, mu, gamma = (jnp.full(2, float(orbit[key])) for key in ("kappa", "mu", "gamma"))
     v_in, v_out, t_in, duration, depth = (
         jnp.array([float(x) for x in orbit[key]]) for key in ("v_in", "v_out", "t_in", "contact", "dmax")
@@ -355,24 +362,24 @@ def test_formula_outruns_the_membrane_on_soft_walls(orbit):
     energy = harvested_energy(DEVICE, depth)
     stiff_enough = orbit["kappa"] > 35
     np.testing.assert_array_equal(energy_ratio(energy, work) <= 1, stiff_enough)
-    # All four sink deeper than R0 = 6.3 mm: refused for that, and allowed by energy alone without the limit.
+    # All four penetrate deeper than R0 = 6.3 mm: rejected by the depth limit, admissible by energy alone.
     assert not np.any(admissible(DEVICE, energy, work, depth))
     unlimited = dataclasses.replace(DEVICE, penetration_limit=math.inf)
     np.testing.assert_array_equal(admissible(unlimited, energy, work, depth), stiff_enough)
 
 
-def test_admissibility_is_both_limits_at_once():
+def test_admissibility_requires_both_limits():
     energy, work, depth = jnp.array([1.0, 1.0, 1.1, 0.0, 1.0, jnp.nan]), jnp.ones(6).at[3].set(0.0), DEVICE.R0
     expected = [True, True, False, True, True, False]
     np.testing.assert_array_equal(admissible(DEVICE, energy, work, depth), expected)
     assert not np.any(admissible(DEVICE, energy, work, depth * (1 + 1e-15)))
     np.testing.assert_array_equal(energy_ratio(energy, work), [1.0, 1.0, 1.1, 0.0, 1.0, jnp.nan])
-    assert float(energy_ratio(1.0, -1.0)) == math.inf  # a rounded W below zero admits nothing
+    assert float(energy_ratio(1.0, -1.0)) == math.inf  # a W rounded below zero is never admissible
     halved = dataclasses.replace(DEVICE, energy_ratio_limit=0.5)
     np.testing.assert_array_equal(admissible(halved, jnp.array([0.5, 0.51]), jnp.ones(2), depth), [True, False])
 
 
-def test_single_precision_stays_single():
+def test_single_precision_is_preserved():
     def cast(values):
         return jnp.asarray(values, "float32")
 

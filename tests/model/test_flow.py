@@ -1,4 +1,4 @@
-"""The closed-form flow against 50 digits, in every regime and at the seams between them."""
+"""The closed-form flow against 50 digits, in all regimes and at the transitions between them."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ NEAR_PI = np.pi * (1 + 1e-9)
 
 
 def contact_cases(rng: np.random.Generator) -> np.ndarray:
-    """Rows kappa, r, c, q, g, w0, z0, s: drawn, and the corners by name."""
+    """Return rows kappa, r, c, q, g, w0, z0, s: random cases and extreme cases."""
     count = 600
     kappa = np.exp(rng.uniform(np.log(0.5), np.log(1e5), count))
     r = np.where(rng.random(count) < 0.2, 10.0 ** rng.uniform(-8, -1, count), rng.uniform(0.02, 1, count))
@@ -23,7 +23,7 @@ def contact_cases(rng: np.random.Generator) -> np.ndarray:
     extra = np.array(corners * 30)
     kappa, r = np.append(kappa, extra[:, 0]), np.append(r, extra[:, 1])
     count = len(kappa)
-    # From far below one free half cycle, over the seam max(kappa, pi) s = 1 of the series, to twenty half cycles.
+    # From far below a free half cycle, over the transition max(kappa, pi) s = 1 to the series, to twenty half cycles.
     turns = np.where(rng.random(count) < 0.3, rng.uniform(0.9, 1.1, count), 10.0 ** rng.uniform(-9, 1.8, count))
     s = turns / np.maximum(kappa, np.pi)
     phase, g = rng.uniform(0, 2, count), rng.choice([0.0, 1.0, 3.0], count) * rng.uniform(-1, 1, count)
@@ -34,21 +34,21 @@ def contact_cases(rng: np.random.Generator) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def contacts():
-    """Cases; (w, w') of the closed form and of the differentiated kind; contact matrix."""
+    """Cases; (w, w') of the closed form and of its form with rolled loops; contact matrix."""
     cases = contact_cases(np.random.default_rng(1))
 
-    def one(kappa, r, c, q, g, w0, z0, s):
+    def evaluate(kappa, r, c, q, g, w0, z0, s):
         pair = ImpactPair(jnp.ones_like(r), kappa, r, g)
         wall = flow.membrane(pair)
         force = flow.Force(c, q, g)
         rolled = flow.oscillate(flow.membrane(pair, rolled=True), force, w0, z0, s)
         return flow.oscillate(wall, force, w0, z0, s), rolled, flow.contact_matrix(wall, s), wall.zeta
 
-    return cases, jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(*cases.T))
+    return cases, jax.tree.map(np.asarray, jax.jit(jax.vmap(evaluate))(*cases.T))
 
 
 def test_oscillate_against_fifty_digits(contacts):
-    """Errors over the size of the terms: the free response, and what the forcing can do in the time."""
+    """Errors relative to the free response plus the largest possible effect of the forcing."""
     cases, (direct, rolled, _, _) = contacts
     worst = {"w": 0.0, "z": 0.0}
     with mp.workdps(DIGITS):
@@ -64,19 +64,19 @@ def test_oscillate_against_fifty_digits(contacts):
     assert max(worst.values()) < 40 * EPS, worst
 
 
-def test_a_contact_from_rest_keeps_its_digits():
-    """w of the forcing alone, for times down to 1e-12: relative, where a difference would have none left."""
+def test_a_contact_from_rest_has_relative_precision():
+    """Relative errors of w by the forcing alone, for times down to 1e-12, where a difference would lose all digits."""
     s = 10.0 ** np.linspace(-12, 0, 60)
     kappa, r = np.tile([0.5, np.pi, 400.0, 1e5], 15), np.tile([1.0, 0.999, 1e-8], 20)
     s = s / np.maximum(kappa, np.pi)
 
-    def one(kappa, r, s):
-        one, zero = jnp.ones_like(s), jnp.zeros_like(s)
+    def evaluate(kappa, r, s):
+        evaluate, zero = jnp.ones_like(s), jnp.zeros_like(s)
         return flow.oscillate(
-            flow.membrane(ImpactPair(one, kappa, r, zero)), flow.Force(one, zero, zero), zero, zero, s
+            flow.membrane(ImpactPair(evaluate, kappa, r, zero)), flow.Force(evaluate, zero, zero), zero, zero, s
         )
 
-    w, z = jax.vmap(one)(kappa, r, s)
+    w, z = jax.vmap(evaluate)(kappa, r, s)
     with mp.workdps(DIGITS):
         for k in range(len(s)):
             true = mp_oscillate(mp.mpf(kappa[k]), mp.mpf(r[k]), (mp.mpf(1), 0, 0), 0, 0, mp.mpf(s[k]))
@@ -104,14 +104,14 @@ def test_flight_against_fifty_digits():
             arm = min(s[k], 1.0)
             size = abs(v0[k]) * s[k] + abs(gamma[k]) * s[k] ** 2 + arm * s[k]
             assert abs(float(float(rise[k]) - u_true)) < 4 * EPS * size, k
-            # The phase t0 itself carries no error; its sine does, a rounding of one.
+            # The phase t0 is exact, but its sine has a rounding.
             assert abs(float(float(v[k]) - v_true)) < 4 * EPS * (abs(v0[k]) + (1 + abs(gamma[k])) * s[k]), k
 
 
 def test_half_turn_is_relative_near_zero_and_exact_at_quadrants():
     rng = np.random.default_rng(3)
     s = np.concatenate([10.0 ** rng.uniform(-15, 0, 300), rng.uniform(-6, 6, 300), [0.25, -0.25, 0.75, 1.75]])
-    values = np.stack([np.asarray(x) for x in jax.vmap(flow.half_turn)(s)])
+    values = np.stack([np.asarray(x) for x in jax.vmap(flow.sin_cos_versine_lag)(s)])
     with mp.workdps(DIGITS):
         for k, x in enumerate(map(mp.mpf, s)):
             truth = (mp.sinpi(x), mp.cospi(x), 2 * mp.sinpi(x / 2) ** 2, mp.pi * x - mp.sinpi(x))
@@ -159,10 +159,10 @@ def test_flight_and_rigid_matrices():
     assert np.linalg.det(matrix) == pytest.approx(0.16, rel=1e-12)
 
 
-def test_a_short_contact_in_which_gravity_balances_the_forcing_keeps_its_digits():
+def test_a_short_contact_with_balanced_forces_has_relative_precision():
     c, less, s = 0.7, 2.0**-40, 3.7e-8
     wall = flow.membrane(ImpactPair(*(jnp.asarray(x) for x in (0.3, 2.0, 1.0, 0.0))))
     force = flow.Force(*(jnp.asarray(x) for x in (c, 0.0, c - less)))
     w, _ = flow.oscillate(wall, force, jnp.zeros(()), jnp.zeros(()), jnp.asarray(s))
-    # Undamped from rest: the Taylor polynomial up to s^4, whose next term is smaller than its rounding.
+    # Undamped from rest: the Taylor polynomial up to s^4; its next term is smaller than its rounding.
     assert float(w) == pytest.approx(0.5 * less * s**2 - (np.pi**2 * c + 4.0 * less) * s**4 / 24, rel=1e-14, abs=0.0)

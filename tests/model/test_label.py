@@ -1,4 +1,4 @@
-"""Names of attractors: counts and period in words, what is no orbit, mirror images."""
+"""Labels of attractors: counts and period in words, motions without a label, mirror images."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vijax.model.label import label, ordered
+from vijax.model.label import label, order_counts
 from vijax.model.records import Status
 
 OK = Status.OK
@@ -39,15 +39,15 @@ def test_mirror_images_take_the_smaller_count_first_where_they_are_merged():
     assert label(2, left, right, merge_mirrors=[True, True, False, False]).tolist()[2] == "2:1/2T"
 
 
-def test_shapes_broadcast_and_keep_their_places():
+def test_shapes_broadcast_and_elements_remain_in_place():
     period = np.array([[1], [2], [0]])
     words = label(period, np.where(period > 0, 1, -1), np.where(period > 0, [[3, 4]], -1))
     assert words.tolist() == [["1:3", "1:4"], ["1:3/2T", "1:4/2T"], ["aperiodic", "aperiodic"]]
 
 
-def test_counts_of_labelled_arrays_are_ordered_along_their_own_dimensions():
+def test_counts_of_labelled_arrays_are_ordered_along_their_dimensions():
     left, right = xr.DataArray([3, 1], dims="d"), xr.DataArray([2, 2], dims="d")
-    few, many = ordered(left, right, xr.DataArray([True, False], dims="gamma"))
+    few, many = order_counts(left, right, xr.DataArray([True, False], dims="gamma"))
     assert few.transpose("gamma", "d").values.tolist() == [[2, 1], [3, 1]]
     assert many.transpose("gamma", "d").values.tolist() == [[3, 2], [2, 2]]
 
@@ -57,7 +57,7 @@ ORBITS = st.tuples(st.integers(1, 32), COUNTS, COUNTS).filter(lambda orbit: orbi
 
 
 @given(orbits=st.lists(ORBITS, min_size=1, max_size=8))
-def test_a_name_tells_its_orbit_and_no_other(orbits):
+def test_a_label_identifies_its_orbit(orbits):
     period, left, right = np.array(orbits).T
     for name, orbit in zip(label(period, left, right), orbits, strict=True):
         counts, _, turns = name.partition("/")

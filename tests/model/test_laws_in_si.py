@@ -1,4 +1,4 @@
-"""Physical membranes: a law given with a device has numbers in SI, and is one membrane at every frequency."""
+"""Physical membranes: the parameters of a law with a device are in SI and describe one membrane at all frequencies."""
 
 import math
 from dataclasses import replace
@@ -9,9 +9,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import vijax
-from vijax.model.membrane import nondimensional
-from vijax.planes.sweep import plan
-from vijax.planes.sweep_settings import SweepSettings
+from vijax.maps.sweep import plan
+from vijax.maps.sweep_settings import SweepSettings
+from vijax.model.walls.membrane import nondimensional
 
 DEVICE = vijax.Harvester(s=0.01, omega0=300.0, A=5.0, omega=60.0, beta=0.02)
 RUBBER = vijax.Hyperelastic(1.3, radius=0.004)
@@ -20,7 +20,7 @@ FINE = {"method": "ode", "solver": "Dopri8", "rtol": 1e-11, "atol": 1e-13}
 
 
 def force(law, device, W, rate):
-    """Acceleration [m/s^2] of a ball that is W [m] within a membrane, in SI, as the law's docstring has it."""
+    """Return the acceleration [m/s^2] of a ball at penetration W [m] in SI, by the formula of the law's docstring."""
     if isinstance(law, vijax.HuntCrossley):
         return -(device.omega0**2) * W * (W / law.depth) ** (law.exponent - 1) * (1 + law.chi * rate)
     loss = -math.log(device.r) / math.hypot(math.pi, math.log(device.r))
@@ -29,8 +29,8 @@ def force(law, device, W, rate):
     return -(device.omega0**2) * W * tension - 2 * loss * device.omega0 * rate
 
 
-def flown_in_si(law, device, u0, v0, periods):
-    """Displacement [m] and velocity [m/s] after some periods, by SciPy, every wall crossing located."""
+def simulate_in_si(law, device, u0, v0, periods):
+    """Return displacement [m] and velocity [m/s] after a number of periods, by SciPy with located wall crossings."""
 
     def flow(tau, y):
         drive = device.A * math.cos(device.omega * tau) - device.g * math.sin(device.beta)
@@ -45,7 +45,7 @@ def flown_in_si(law, device, u0, v0, periods):
     while tau < end:
         part = solve_ivp(flow, (tau, end), y, "DOP853", events=wall, rtol=1e-12, atol=1e-15)
         tau, y = part.t[-1], part.y[:, -1]
-        if tau < end:  # a little beyond the wall, so that it is not met again at once
+        if tau < end:  # slightly inside the wall, so that the same crossing is not located again
             rate = flow(tau + 1e-13, y)
             tau, y = tau + 1e-12, [y[0] + 1e-12 * rate[0], y[1] + 1e-12 * rate[1]]
     return y
@@ -53,34 +53,34 @@ def flown_in_si(law, device, u0, v0, periods):
 
 @pytest.mark.parametrize("omega", [40.0, pytest.param(60.0, marks=pytest.mark.long)])
 @pytest.mark.parametrize("law", [RUBBER, HERTZ], ids=["rubber", "hertz"])
-def test_the_motion_is_that_of_the_equation_in_si(law, omega):
+def test_the_motion_agrees_with_the_equation_in_si(law, omega):
     device = replace(DEVICE, omega=omega)
     u0, v0, pair = 1e-3, 0.2, device.pair()
     if not law.restitution:
         pair = vijax.impact_pair(pair.d, pair.kappa, None, pair.gamma)
-    own = law.nondimensional(device)
-    run = vijax.trajectory(pair, u0 / device.length_unit, v0 / device.speed_unit, 2, membrane=own, **FINE)
+    nondimensional = law.nondimensional(device)
+    run = vijax.trajectory(pair, u0 / device.length_unit, v0 / device.speed_unit, 2, membrane=nondimensional, **FINE)
     assert int(run.filled) >= 3
-    found = float(run.states.u[-1]) * device.length_unit, float(run.states.v[-1]) * device.speed_unit
-    np.testing.assert_allclose(found, flown_in_si(law, device, u0, v0, 2), rtol=0, atol=2e-8)
+    actual = float(run.states.u[-1]) * device.length_unit, float(run.states.v[-1]) * device.speed_unit
+    np.testing.assert_allclose(actual, simulate_in_si(law, device, u0, v0, 2), rtol=0, atol=2e-8)
 
 
-def test_one_membrane_over_axes_of_frequency_and_amplitude():
-    """Each cell is that of its own device; before, numbers in units of the pair made another membrane of each."""
+def test_a_membrane_is_the_same_over_axes_of_frequency_and_amplitude():
+    """Each cell equals the cell of its device; in units of the pair the membrane would differ between cells."""
     axes, settings = {"omega": [40.0, 60.0], "A": [4.0, 6.0]}, {"periods": 12, "until": "window", "method": "ode"}
-    found = vijax.sweep(**axes, device=DEVICE, membrane=RUBBER, outputs=["P", "max_penetration"], **settings)
-    assert found.P.dims == ("omega", "A")
+    plane = vijax.sweep(**axes, device=DEVICE, membrane=RUBBER, outputs=["P", "max_penetration"], **settings)
+    assert plane.P.dims == ("omega", "A")
     for omega in axes["omega"]:
         for A in axes["A"]:
             device = replace(DEVICE, omega=omega, A=A)
-            cell, pair, law = found.sel(omega=omega, A=A), device.pair(), RUBBER.nondimensional(device)
+            cell, pair, law = plane.sel(omega=omega, A=A), device.pair(), RUBBER.nondimensional(device)
             start = min(0.05853, 0.49 * float(pair.d)), -0.47898
             run = vijax.trajectory(pair, *start, 12, method="ode", membrane=law)
             deepest = float(np.nanmax(run.impacts.depth)) * device.length_unit
             assert float(cell.max_penetration) == pytest.approx(deepest, rel=1e-4)
 
 
-def test_a_radius_that_is_not_given_is_that_of_the_device():
+def test_the_default_radius_is_the_radius_of_the_device():
     walls = replace(DEVICE, R0=vijax.Sides(0.007, 0.009))
     law = nondimensional(vijax.Hyperelastic(1.3), walls)
     unit = float(DEVICE.length_unit)
@@ -92,7 +92,7 @@ def test_a_radius_that_is_not_given_is_that_of_the_device():
         assert planned.cells.dynamic == ("omega",)
 
 
-def test_a_number_with_a_unit_is_not_taken_for_one_in_units_of_a_pair():
+def test_a_number_with_a_unit_is_not_accepted_in_units_of_a_pair():
     import pint
 
     units = pint.UnitRegistry()
@@ -109,22 +109,22 @@ def test_a_number_with_a_unit_is_not_taken_for_one_in_units_of_a_pair():
 
 
 class Stiff(vijax.MembraneLaw):
-    """A law of one's own that says which of its numbers has a dimension: a cubic term [1/m^2]."""
+    """A custom law with a parameter that has a dimension: a cubic term [1/m^2]."""
 
     cubic: float
 
     def acceleration(self, pair, w, z):
-        """A spring that stiffens, and a damper."""
+        """Return the acceleration by a stiffening spring and a damper."""
         return -(pair.kappa**2 * (w + self.cubic * w**3) + pair.mu * z)
 
     def in_units(self, length, speed):
-        """The cubic term in another unit of length."""
+        """Return the law with the cubic term in another unit of length."""
         return Stiff(self.cubic * length**2)
 
 
-def test_a_law_of_ones_own_may_be_in_si():
-    own = Stiff(1e5).nondimensional(DEVICE)
-    assert float(own.cubic) == pytest.approx(1e5 * float(DEVICE.length_unit) ** 2, rel=1e-15)
+def test_a_custom_law_may_be_in_si():
+    nondimensional = Stiff(1e5).nondimensional(DEVICE)
+    assert float(nondimensional.cubic) == pytest.approx(1e5 * float(DEVICE.length_unit) ** 2, rel=1e-15)
 
 
 @pytest.fixture(scope="module")
@@ -134,11 +134,11 @@ def orbits():
 
 
 @pytest.mark.long
-def test_a_branch_along_the_frequency_has_one_membrane(orbits):
+def test_a_branch_along_the_frequency_has_a_single_membrane(orbits):
     (branch,) = vijax.follow_orbits(orbits[:1], "omega", (59.0, 61.0), direction="up", device=DEVICE)
     end = replace(DEVICE, omega=float(branch.values[-1]))
-    found, law = branch.orbit[-1].pair, RUBBER.nondimensional(end)
-    assert float(found.law.radius) == pytest.approx(float(law.radius), rel=1e-12)
+    pair, law = branch.orbit[-1].pair, RUBBER.nondimensional(end)
+    assert float(pair.law.radius) == pytest.approx(float(law.radius), rel=1e-12)
     assert branch.values[-1] > 60.5
 
 

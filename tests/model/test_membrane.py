@@ -1,4 +1,4 @@
-"""Stored energies and forces of membranes: those of rubber follow from its strain energy, whatever we wrote of them."""
+"""Stored energies and forces of membranes; the forces of rubber are derived here from its strain energy."""
 
 import math
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import vijax
-from vijax.model.membrane import Linear
+from vijax.model.walls.membrane import Linear
 
 PAIR = vijax.impact_pair(0.2, 40.0, 0.5)
 DEPTHS = np.array([1e-6, 1e-3, 0.02, 0.07])
@@ -25,7 +25,7 @@ def of(name):
 
 
 def strain_energy(law, w, ratio=0.0):
-    """That of Mooney and Rivlin with C1 = 1/2, C2 = ratio/2, or of Gent, in the cone; 50 digits, up to a factor."""
+    """Return the strain energy of Mooney-Rivlin (C1 = 1/2, C2 = ratio/2) or Gent in the cone, up to a factor."""
     hoop = mpmath.mpf(float(law.prestretch)) ** 2
     along = hoop * (1 + (mpmath.mpf(w) / mpmath.mpf(float(law.radius))) ** 2)
     thin = 1 / (hoop * along)
@@ -42,21 +42,21 @@ def strain_energy(law, w, ratio=0.0):
 def test_the_force_of_rubber_is_the_derivative_of_its_strain_energy(name, ratio):
     law = of(name)
     with mpmath.workdps(50):
-        # kappa^2 is the derivative of the force at w = 0, whatever the modulus and the thickness are.
+        # kappa^2 is the derivative of the force at w = 0, for any modulus and thickness.
         scale = 40**2 / mpmath.diff(lambda w: strain_energy(law, w, ratio), 0, 2)
         expected = [float(-scale * mpmath.diff(lambda w: strain_energy(law, w, ratio), w)) for w in DEPTHS]
         stored = [float(scale * (strain_energy(law, w, ratio) - strain_energy(law, 0, ratio))) for w in DEPTHS]
-    found = [float(law.acceleration(PAIR, jnp.asarray(w), jnp.zeros(()))) for w in DEPTHS]
-    np.testing.assert_allclose(found, expected, rtol=1e-13)
+    forces = [float(law.acceleration(PAIR, jnp.asarray(w), jnp.zeros(()))) for w in DEPTHS]
+    np.testing.assert_allclose(forces, expected, rtol=1e-13)
     np.testing.assert_allclose(law.energy(PAIR, DEPTHS), stored, rtol=1e-13)
 
 
 @pytest.mark.parametrize("law", [*map(of, RUBBERS), Linear(), vijax.HuntCrossley(0.5, 2.0)], ids=str)
-def test_stored_energy_is_the_force_along_its_way(law):
+def test_stored_energy_is_the_integral_of_the_force(law):
     np.testing.assert_allclose(law.energy(PAIR, DEPTHS), vijax.MembraneLaw.energy(law, PAIR, DEPTHS), rtol=1e-8)
 
 
-def test_the_energy_of_a_law_of_ones_own_is_found_by_quadrature():
+def test_the_energy_of_a_custom_law_is_computed_by_quadrature():
     class Cubic(vijax.MembraneLaw):
         beta: float
 
@@ -72,11 +72,12 @@ def test_rubber_is_a_spring_at_small_w_and_has_the_damping_of_the_pair():
     law = of("well stretched")
     slope = jax.grad(lambda w, z: law.acceleration(PAIR, w, z), argnums=(0, 1))(jnp.asarray(0.0), jnp.asarray(0.0))
     np.testing.assert_allclose(slope, (-(40.0**2), -PAIR.mu), rtol=1e-14)
-    once = law.acceleration(PAIR, jnp.asarray(-0.01), jnp.asarray(0.0))  # a stage of a step looks beyond the exit
+    # A stage of a step may evaluate the law after the exit.
+    once = law.acceleration(PAIR, jnp.asarray(-0.01), jnp.asarray(0.0))
     assert once == -law.acceleration(PAIR, jnp.asarray(0.01), jnp.asarray(0.0)) > 0
 
 
-def test_chains_at_their_limit_let_nothing_through():
+def test_gent_membranes_are_never_penetrated_to_their_limit():
     law = of("near its limit")
     push = [float(law.acceleration(PAIR, jnp.asarray(w), jnp.zeros(()))) for w in (0.05, 0.06, 0.07, 0.08, 0.2)]
     assert all(np.isfinite(push))
@@ -84,25 +85,25 @@ def test_chains_at_their_limit_let_nothing_through():
     assert push[-1] < -1e6
 
 
-def test_a_ball_goes_as_deep_as_the_energy_says():
-    hard, soft = (vijax.Hyperelastic(1.2, radius) for radius in (0.01, 1e4))
+def test_the_penetration_follows_from_the_energy():
+    small, large = (vijax.Hyperelastic(1.2, radius) for radius in (0.01, 1e4))
     near = vijax.impact_pair(0.2, 40.0, 0.999)
     deep = {}
-    for law in (hard, soft):
+    for law in (small, large):
         motion = vijax.trajectory(near, 0.0, 3.0, 1, method="ode", membrane=law)
         impact = jax.tree.map(lambda x: float(x[0]), motion.impacts)
-        # Next to the forcing, of at most 1, and damping as good as none: v^2/2 and what the forcing gives on the way.
+        # The forcing is at most 1 and the damping tiny: v^2/2 plus the work of the forcing.
         kinetic = 0.5 * impact.v_in**2
         assert abs(float(law.energy(near, impact.depth)) - kinetic) < 2 * impact.depth + 0.01 * kinetic
         deep[law] = impact.depth
     linear = vijax.trajectory(near, 0.0, 3.0, 1).impacts
-    assert abs(deep[soft] / float(linear.depth[0]) - 1) < 1e-6
-    # Far beyond its radius the membrane is a spring again, without what thinning takes off the tension.
-    assert abs(deep[hard] / deep[soft] / math.sqrt(1 - 1.2**-6) - 1) < 0.01
+    assert abs(deep[large] / float(linear.depth[0]) - 1) < 1e-6
+    # Far beyond its radius the membrane is a spring again, without the part of the tension that thinning removes.
+    assert abs(deep[small] / deep[large] / math.sqrt(1 - 1.2**-6) - 1) < 0.01
 
 
 @pytest.mark.parametrize(
-    ("numbers", "said"),
+    ("numbers", "message"),
     [
         ({"prestretch": 1.0, "radius": 0.1}, "prestretch must be one finite number above 1; got 1.0"),
         ({"prestretch": 1.5, "radius": 0.0}, "radius must be one finite number above 0; got 0.0"),
@@ -112,6 +113,6 @@ def test_a_ball_goes_as_deep_as_the_energy_says():
         ({"prestretch": 1.5, "radius": 0.1, "stretch_limit": math.nan}, "stretch_limit must"),
     ],
 )
-def test_numbers_that_no_rubber_has_are_refused(numbers, said):
-    with pytest.raises(ValueError, match=said):
+def test_invalid_parameters_of_rubber_are_rejected(numbers, message):
+    with pytest.raises(ValueError, match=message):
         vijax.Hyperelastic(**numbers)

@@ -1,4 +1,4 @@
-"""The device, its two scalings, the calibration of the membrane, and the door."""
+"""The device, its two scalings, the calibration of the membrane, and the validation of arguments."""
 
 import dataclasses
 import math
@@ -12,15 +12,15 @@ import pytest
 
 from vijax.model.device import LIMITS, Harvester, with_constants, with_pair
 from vijax.model.pair import ImpactPair, impact_pair
-from vijax.model.restitution import damping_ratio
-from vijax.model.sides import Sides
+from vijax.model.walls.restitution import damping_ratio
+from vijax.model.walls.sides import Sides
 
-# Round trips are a handful of roundings.
+# Round trips have a few roundings.
 ROUND_TRIP = 1e-14
 
 
 def drawn_device(count: int = 200) -> Harvester:
-    """Devices over the ranges of the field: an array in every constant that shapes the dynamics."""
+    """Return devices over the ranges of the field, with an array for each constant that affects the dynamics."""
     rng = np.random.default_rng(1)
     return Harvester(
         m_b=rng.uniform(1e-3, 1e-2, count),
@@ -34,7 +34,7 @@ def drawn_device(count: int = 200) -> Harvester:
 
 
 def drawn_pair(count: int = 200) -> ImpactPair:
-    """Pairs over the whole range of the engine."""
+    """Return pairs over the full range of the simulation."""
     rng = np.random.default_rng(2)
     return impact_pair(
         10 ** rng.uniform(-2.3, 0.3, count),
@@ -47,7 +47,7 @@ def drawn_pair(count: int = 200) -> ImpactPair:
 # --- the device and its scalings -------------------------------------------------------------------------------------
 
 
-def test_defaults_are_tables_one_and_two():
+def test_defaults_are_the_values_of_tables_i_and_ii():
     device = Harvester()
     pair = device.pair()
     assert float(pair.mu) == pytest.approx(172.36301, abs=5e-6)
@@ -76,8 +76,8 @@ def test_device_of_pair_and_back():
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=ROUND_TRIP), again, walled)
 
 
-def test_units_turn_the_si_equation_into_the_nondimensional_one():
-    """The same point of motion, once in m_b U'' = ... of the device and once in Eq. (38)."""
+def test_units_transform_the_si_equation_to_the_nondimensional_equation():
+    """The acceleration of one state, from m_b U'' = ... of the device and from Eq. (38)."""
     device, t, u, v = drawn_device(), 0.3, 0.7, -0.4
     pair = device.pair()
     depth, speed = (u - pair.d / 2) * device.length_unit, v * device.speed_unit
@@ -109,7 +109,7 @@ def test_constants_are_traced():
     assert float(kappa(Harvester(omega0=40.0, R0=0.01))) == 40.0
     assert len(traces) == 1
     numbers = [field for field in dataclasses.fields(Harvester) if field.default is not None]
-    assert len(jax.tree.leaves(Harvester())) == len(numbers)  # none is static
+    assert len(jax.tree.leaves(Harvester())) == len(numbers)  # no field is static
 
 
 # --- calibration -----------------------------------------------------------------------------------------------------
@@ -136,8 +136,8 @@ def test_elastic_wall_has_no_damping():
 
 @pytest.mark.parametrize("kappa", [0.5, math.pi, 40.0, 400.0, 1e5])
 @pytest.mark.parametrize("r", [1e-3, 0.1, 0.5, 0.95, 0.999, 1.0])
-def test_free_contact_gives_back_r(kappa, r):
-    """Eqs. (14)-(18) without forcing: w'' + mu w' + kappa^2 w = 0 from w = 0 leaves at -r times its speed."""
+def test_a_free_contact_has_the_restitution_r(kappa, r):
+    """Eqs. (14)-(18) without forcing: w'' + mu w' + kappa^2 w = 0 from w = 0 exits at -r times the entry speed."""
     pair = impact_pair(0.2, kappa, r)
     with mp.workdps(40):
         zeta, k = mp.mpf(float(pair.mu)) / 2, mp.mpf(kappa)
@@ -150,12 +150,12 @@ def test_free_contact_gives_back_r(kappa, r):
         assert abs(depth(duration)) < 1e-30
         assert depth(0.999 * duration) > 0
         restitution = -mp.diff(depth, duration)
-    # An error of eps in mu becomes one of about (1 + ln^2 r/pi^2) |ln r| eps in r.
+    # An error of eps in mu causes an error of about (1 + ln^2 r/pi^2) |ln r| eps in r.
     assert float(restitution) == pytest.approx(r, rel=1e-13, abs=0)
     assert float(pair.omega1) == pytest.approx(float(omega1), rel=1e-12, abs=0)
 
 
-# --- the door --------------------------------------------------------------------------------------------------------
+# --- validation ------------------------------------------------------------------------------------------------------
 
 GRID = np.full((4, 8), 0.5)
 GRID[3, 7] = -0.2
@@ -205,18 +205,18 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("call", "message"), REFUSED, ids=[message[:30] for _, message in REFUSED])
-def test_door(call, message):
+def test_arguments_are_validated(call, message):
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
         call()
     assert "\n" not in str(caught.value)
 
 
-def test_traced_values_pass_the_door():
+def test_traced_values_are_not_validated():
     assert jax.jit(lambda r: impact_pair(0.2, 4.0, r).r)(-1.0) == -1.0
     assert float(jax.grad(lambda s: Harvester(s=s).pair().d)(-0.3)) == 1.0
 
 
-def test_impact_pair_broadcasts_and_keeps_single_precision():
+def test_impact_pair_broadcasts_and_preserves_single_precision():
     pair = impact_pair(np.ones((3, 1)), np.ones(4), 1)
     assert {field.shape for field in jax.tree.leaves(pair)} == {(3, 4)}
     single = impact_pair(jnp.ones(2, "float32"), 4.0, 1, 0)
@@ -224,7 +224,7 @@ def test_impact_pair_broadcasts_and_keeps_single_precision():
     assert impact_pair(1, 4, 1).d.dtype == jnp.dtype("float64")
 
 
-def test_a_pair_of_a_membrane_that_takes_no_restitution_has_none():
+def test_a_pair_with_a_membrane_without_restitution_has_r_none():
     assert impact_pair([0.2, 0.3], 40.0, None).r is None
     with pytest.raises(ValueError, match="r_right must"):
         impact_pair(0.2, 40.0, Sides(0.5, None))

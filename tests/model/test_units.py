@@ -1,4 +1,4 @@
-"""Units: what a number with one is in SI, at every door that takes physical quantities, and what is refused."""
+"""Units: conversion to SI in every public function that takes physical quantities, and rejected units."""
 
 import math
 import sys
@@ -11,11 +11,12 @@ import pytest
 
 import vijax
 from scripts import orbit_diagram as diagram_script
-from vijax.model import quantities, units, variables
+from vijax.continuation import branch_continuation
+from vijax.maps import axes, map_dataset, orbit_diagram, sweep
+from vijax.model import quantities, tuned_quantities, units
 from vijax.model.device import CONSTANTS, Harvester, with_constants
 from vijax.model.pair import impact_pair
-from vijax.orbits import continuation, orbit_search
-from vijax.planes import axes, dataset, orbit_diagram, sweep
+from vijax.orbits import orbit_search
 
 U = pint.UnitRegistry()
 HZ = 2 * math.pi
@@ -66,12 +67,12 @@ def test_a_file_of_numbers_with_units(tmp_path):
         ("s", "-5mm", "s must be positive and finite; got -0.005"),
     ],
 )
-def test_what_is_no_unit_of_a_quantity_is_told(name, text, message):
+def test_wrong_units_are_rejected(name, text, message):
     with pytest.raises(ValueError, match=message):
         axes.parse_axis(name, text)
 
 
-def test_every_constant_of_the_device_takes_its_unit():
+def test_all_constants_of_the_device_accept_their_unit():
     plain = Harvester(beta=0.1, penetration_limit=0.004)
     names = [name for name in (*CONSTANTS, "penetration_limit") if name in units.UNITS]
     scaled = {name: 1e3 * getattr(plain, name) * U.Unit(units.UNITS[name]) / 1e3 for name in names}
@@ -84,16 +85,16 @@ def test_every_constant_of_the_device_takes_its_unit():
         Harvester(V=U.Quantity(1, "mm"))
 
 
-def test_quantities_of_pint_at_the_doors():
+def test_public_functions_convert_quantities_of_pint():
     swept = sweep.plan(
         {"omega": U.Quantity([2, 3], "Hz"), "s": [30 * U.cm, 0.4 * U.m]},
         ["P"],
     )
-    np.testing.assert_allclose(swept.cells.given["omega"], [2 * HZ, 3 * HZ], rtol=1e-14)
-    np.testing.assert_allclose(swept.cells.given["s"], [0.3, 0.4], rtol=1e-14)
+    np.testing.assert_allclose(swept.cells.axes["omega"], [2 * HZ, 3 * HZ], rtol=1e-14)
+    np.testing.assert_allclose(swept.cells.axes["s"], [0.3, 0.4], rtol=1e-14)
     planned = orbit_diagram.plan("beta", U.Quantity([1, 2], "deg"), {})
-    np.testing.assert_allclose(planned.planned.cells.given["beta"], np.radians([1, 2]), rtol=1e-14)
-    bounds = variables.limits(("omega0",), {"omega0": (2 * U.Hz, 3 * U.Hz)}, Harvester())
+    np.testing.assert_allclose(planned.plan.cells.axes["beta"], np.radians([1, 2]), rtol=1e-14)
+    bounds = tuned_quantities.bounds_of(("omega0",), {"omega0": (2 * U.Hz, 3 * U.Hz)}, Harvester())
     np.testing.assert_allclose(bounds[:, 0], [2 * HZ, 3 * HZ], rtol=1e-14)
     harvested = vijax.harvested_energy(Harvester(), 2 * U.mm)
     assert float(harvested) == pytest.approx(float(vijax.harvested_energy(Harvester(), 0.002)), rel=1e-14)
@@ -105,16 +106,17 @@ def test_quantities_of_pint_at_the_doors():
 
 
 def test_a_branch_between_bounds_with_units():
-    found = orbit_search.search(Harvester(s=0.2).pair("rigid"), "RL", guesses=32)[:1]
-    kept = {"direction": "up", "points": 4, "device": Harvester(s=0.2)}
-    own, plain = (
-        continuation.follow(found, "s", within, **kept)[0] for within in ((19 * U.cm, 210 * U.mm), (0.19, 0.21))
+    orbits = orbit_search.find_orbits(Harvester(s=0.2).pair("rigid"), "RL", guesses=32)[:1]
+    options = {"direction": "up", "points": 4, "device": Harvester(s=0.2)}
+    with_units, plain = (
+        branch_continuation.follow_orbits(orbits, "s", within, **options)[0]
+        for within in ((19 * U.cm, 210 * U.mm), (0.19, 0.21))
     )
-    np.testing.assert_allclose(own.values, plain.values, rtol=1e-12)
+    np.testing.assert_allclose(with_units.values, plain.values, rtol=1e-12)
 
 
 def test_datasets_write_the_same_units():
-    written = {name: axis.cf for name, axis in quantities.AXES.items()}
+    written = {name: axis.cf_unit for name, axis in quantities.AXES.items()}
     assert written == dict.fromkeys(quantities.AXES, "1") | {
         **{
             "omega": "rad s-1",
@@ -130,36 +132,36 @@ def test_datasets_write_the_same_units():
     }
 
 
-def test_degrees_taken_for_radians_are_warned_of():
+def test_a_warning_if_radians_are_probably_degrees():
     with pytest.warns(UserWarning, match="beta is up to 20 rad, which is beyond pi/2; 20 degrees are 20deg"):
         Harvester(beta=20.0)
     with pytest.warns(UserWarning, match="beta is up to 20 rad"):
         axes.check_axis("beta", [0.1, -20.0])
 
 
-def test_a_ball_that_gravity_holds_is_warned_of(tmp_path):
-    kept: dict[str, Any] = {"d": [0.2, 0.3], "wall": "rigid", "periods": 30}
+def test_a_warning_if_gravity_causes_permanent_contact(tmp_path):
+    settings: dict[str, Any] = {"d": [0.2, 0.3], "wall": "rigid", "periods": 30}
     for out in (None, tmp_path / "held.zarr"):
-        with pytest.warns(UserWarning, match=r"gravity holds the ball: gamma = 3.352, permanent contact everywhere"):
-            held = vijax.sweep(**kept, beta=20 * U.deg, out=out)
-    lively = vijax.sweep(**kept, beta=0 * U.deg)
-    assert (held.status == vijax.Status.PERMANENT_CONTACT).all()
-    dataset.warn_if_held(lively)  # would be an error
+        with pytest.warns(UserWarning, match=r"gravity keeps the ball in permanent contact everywhere: gamma = 3.352"):
+            inclined = vijax.sweep(**settings, beta=20 * U.deg, out=out)
+    level = vijax.sweep(**settings, beta=0 * U.deg)
+    assert (inclined.status == vijax.Status.PERMANENT_CONTACT).all()
+    map_dataset.warn_if_permanent_contact(level)  # a warning would be an error
 
 
 def test_from_the_command_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    asked = []
-    monkeypatch.setattr(orbit_diagram, "run", lambda planned, _: asked.append(planned) or _stop())
+    plans = []
+    monkeypatch.setattr(orbit_diagram, "run", lambda planned, _: plans.append(planned) or _stop())
     chosen = ["--along", "omega=2Hz:10Hz:3", "--s", "30cm", "--set", "penetration_limit=4mm", "--set", "V=1.7kV"]
     with pytest.raises(_StopError):
         diagram_script.main(chosen)
-    device = asked[0].planned.device
+    device = plans[0].plan.device
     assert (float(device.penetration_limit), float(device.V)) == (pytest.approx(0.004), 1700)
-    np.testing.assert_allclose(asked[0].planned.cells.given["omega"], np.array([2, 6, 10]) * HZ, rtol=1e-14)
+    np.testing.assert_allclose(plans[0].plan.cells.axes["omega"], np.array([2, 6, 10]) * HZ, rtol=1e-14)
     with pytest.raises(_StopError):
         diagram_script.main(["--along", "d=0.1:0.2:3", "--penetration-limit", "4mm", "--energy-ratio-limit", "0.1"])
-    device = asked[1].planned.device
+    device = plans[1].plan.device
     assert (float(device.penetration_limit), device.energy_ratio_limit) == (pytest.approx(0.004), 0.1)
     assert diagram_script.main(["--energy-ratio-limit", "2"]) == 2
     assert "energy_ratio_limit must lie in (0, 1]; got 2.0; 1 admits all energy" in capsys.readouterr().err
@@ -173,7 +175,7 @@ def test_from_the_command_line(tmp_path, monkeypatch, capsys):
 
 
 class _StopError(Exception):
-    """Ends a script before it runs."""
+    """Stops a script before it runs."""
 
 
 def _stop():
@@ -181,8 +183,8 @@ def _stop():
 
 
 @pytest.mark.long
-def test_while_another_thread_imports_pint_numbers_pass(monkeypatch):
-    """A module is known before what is in it: tracing beside an import of zarr, which imports pint, once failed."""
+def test_numbers_are_valid_while_another_thread_imports_pint(monkeypatch):
+    """A module is registered before its import is complete: tracing during an import of pint by zarr once failed."""
     monkeypatch.setitem(sys.modules, "pint", types.ModuleType("pint"))
-    assert units.plain("d", 0.2) == 0.2
-    assert units.plain("d", [0.2, 0.3]) == [0.2, 0.3]
+    assert units.plain_number("d", 0.2) == 0.2
+    assert units.plain_number("d", [0.2, 0.3]) == [0.2, 0.3]

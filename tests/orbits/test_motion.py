@@ -1,4 +1,4 @@
-"""The dense curve between impacts: on the walls at both ends of a contact, through the states that the engine gives."""
+"""Dense curves between impacts: contacts start and end on the walls, and the curve passes the simulated states."""
 
 import numpy as np
 import pytest
@@ -9,28 +9,28 @@ from vijax.orbits.motion import curve, states
 PERIODS = 6
 
 
-def drawn(wall: str, gamma: float):
+def simulate_curve(wall: str, gamma: float):
     pair = vijax.impact_pair(0.2, 40.0 if wall == "soft" else None, 0.5, gamma)
     path = vijax.trajectory(pair, 0.02, 0.3, PERIODS)
-    found = path.impacts
-    t = np.asarray(found.t) + 2.0 * np.asarray(found.n)
-    impacts = (t, found.side, found.v_in, found.v_out, found.duration)
+    recorded = path.impacts
+    t = np.asarray(recorded.t) + 2.0 * np.asarray(recorded.n)
+    impacts = (t, recorded.side, recorded.v_in, recorded.v_out, recorded.duration)
     return pair, path, impacts, curve(pair, *impacts, samples=400)
 
 
 @pytest.fixture(scope="module", params=[("soft", 0.0), ("soft", 0.2), ("rigid", 0.0)], ids=str)
 def case(request):
-    return drawn(*request.param)
+    return simulate_curve(*request.param)
 
 
 def test_the_curve_passes_through_the_stroboscopic_states(case):
     _, path, _, line = case
-    clock = 2.0 * np.arange(1, PERIODS)  # the last impact ends before the last period does
-    apart = np.diff(line.t) > 0
+    clock = 2.0 * np.arange(1, PERIODS)  # the last impact ends before the last period
+    distinct = np.diff(line.t) > 0
     for values, strobes in ((line.u, path.states.u), (line.v, path.states.v)):
-        # Between samples 1/400 of a flight apart a straight line errs by less than this.
-        between = np.interp(clock, line.t[1:][apart], values[1:][apart])
-        np.testing.assert_allclose(between, np.asarray(strobes)[: PERIODS - 1], atol=2e-5)
+        # Samples are 1/400 of a flight apart; linear interpolation has a smaller error than this tolerance.
+        interpolated = np.interp(clock, line.t[1:][distinct], values[1:][distinct])
+        np.testing.assert_allclose(interpolated, np.asarray(strobes)[: PERIODS - 1], atol=2e-5)
 
 
 def test_contacts_begin_and_end_on_the_wall(case):
@@ -45,7 +45,7 @@ def test_contacts_begin_and_end_on_the_wall(case):
     np.testing.assert_allclose(u[:-1, 1, -1], wall[1:], atol=1e-14)
 
 
-def test_states_at_given_times_are_those_of_the_engine(case):
+def test_states_at_specified_times_equal_the_simulated_states(case):
     pair, path, impacts, line = case
     u, v = states(pair, *impacts, when=2.0 * np.arange(PERIODS))
     np.testing.assert_allclose(u[1:], path.states.u[: PERIODS - 1], atol=1e-13)
@@ -55,13 +55,13 @@ def test_states_at_given_times_are_those_of_the_engine(case):
     np.testing.assert_allclose([u, v], [line.u[:400], line.v[:400]], atol=1e-13)
 
 
-def test_no_impact_draws_nothing():
-    nothing = np.full(5, np.nan)
-    line = curve(vijax.impact_pair(0.3, 40.0, 0.5), nothing, nothing, nothing, nothing, nothing)
+def test_curve_without_impacts_is_empty():
+    missing = np.full(5, np.nan)
+    line = curve(vijax.impact_pair(0.3, 40.0, 0.5), missing, missing, missing, missing, missing)
     assert line.t.size == 0
 
 
-def test_later_impacts_change_nothing_before_them():
+def test_later_impacts_do_not_change_the_earlier_curve():
     pair, row = vijax.impact_pair(0.2, 40.0, 0.5), np.array([0.1, 1.1, 2.1, 3.1])
     side = np.array([1, -1, 1, -1])
     short, long = (curve(pair, row[:n], side[:n], 0.3 * side[:n], -0.15 * side[:n], 0 * row[:n]) for n in (3, 4))

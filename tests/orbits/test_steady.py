@@ -1,4 +1,4 @@
-"""Steady states: values and gradients of 50-digit orbits, second derivatives, and NaN where none can be meant."""
+"""Steady states: values and derivatives of orbits in 50 digits, second derivatives, and NaN where no orbit attracts."""
 
 import dataclasses
 import json
@@ -20,36 +20,43 @@ from vijax.orbits.steady import steady
 DEVICE = Harvester()
 
 
-def known(references, twist=1.0):
-    """Orbits as they are written down, knots off by a factor."""
-    # Nothing is weakly typed: the program would be compiled again for what is moved, or found.
-    pair = jax.tree.map(lambda *x: jnp.asarray(np.array(x)), *(one.pair for one in references))
+def reference_batch(references, factor=1.0):
+    """Return the orbits of the references, with impact unknowns multiplied by a factor."""
+    # No leaf is weakly typed; a weak type would compile the program again for other orbits.
+    pair = jax.tree.map(lambda *x: jnp.asarray(np.array(x)), *(reference.pair for reference in references))
     count = len(references)
-    side = jnp.asarray([one.side for one in references], jnp.int32)
+    side = jnp.asarray([reference.side for reference in references], jnp.int32)
     sequence = Sequence(side, jnp.full(count, 2.0, float), jnp.zeros(count, bool))
     blank = jnp.full(side.shape, jnp.nan, float)
-    knots = jnp.asarray([one.knots for one in references]) * twist
+    impact_unknowns = jnp.asarray([reference.impact_unknowns for reference in references]) * factor
     return periodic.Orbit(
-        pair, sequence, knots, blank, blank, jnp.zeros((count, 2), complex), blank[:, 0], jnp.zeros(count, jnp.int32)
+        pair,
+        sequence,
+        impact_unknowns,
+        blank,
+        blank,
+        jnp.zeros((count, 2), complex),
+        blank[:, 0],
+        jnp.zeros(count, jnp.int32),
     )
 
 
-def of_pair(pair, orbit):
-    """What the tests differentiate: energy per half period, largest speed."""
-    found = steady(DEVICE, orbit, pair=pair)
-    return jnp.stack([found.P, found.speed]), found
+def power_and_speed(pair, orbit):
+    """Return power (energy per half period) and largest speed, which the tests differentiate, and the steady state."""
+    state = steady(DEVICE, orbit, pair=pair)
+    return jnp.stack([state.P, state.speed]), state
 
 
 @pytest.fixture(scope="module")
-def found():
-    """Steady states of the references and their derivatives, forward, from guesses 1 % off."""
-    guess = known(reference_orbits(), 1 + 0.01 * np.array([1, -1, 1]))
-    slope = jax.jit(jax.vmap(jax.jacfwd(of_pair, has_aux=True)))
+def reference_results():
+    """Return guesses 1 % off the references, the forward derivative, and the derivatives and steady states."""
+    guess = reference_batch(reference_orbits(), 1 + 0.01 * np.array([1, -1, 1]))
+    slope = jax.jit(jax.vmap(jax.jacfwd(power_and_speed, has_aux=True)))
     return guess, slope, *slope(guess.pair, guess)
 
 
-def test_values_are_those_of_50_digits(found):
-    _, _, _, state = found
+def test_values_match_50_digits(reference_results):
+    _, _, _, state = reference_results
     np.testing.assert_array_equal(state.status, Status.OK)
     for index, (row, reference) in enumerate(zip(reference_rows(), reference_orbits(), strict=True)):
         assert float(state.P[index]) == pytest.approx(float(row["P_J"]), rel=1e-13)
@@ -57,14 +64,14 @@ def test_values_are_those_of_50_digits(found):
         assert float(state.multiplier[index]) == pytest.approx(np.abs(reference.multipliers).max(), rel=1e-10)
 
 
-def test_derivatives_in_kappa_are_those_of_50_digits(found):
-    _, _, slopes, _ = found
-    wanted = [float(row["dP_dkappa"]) for row in reference_rows()]
-    np.testing.assert_allclose(slopes.kappa[:, 0], wanted, rtol=1e-12)
+def test_derivatives_by_kappa_match_50_digits(reference_results):
+    _, _, slopes, _ = reference_results
+    expected = [float(row["dP_dkappa"]) for row in reference_rows()]
+    np.testing.assert_allclose(slopes.kappa[:, 0], expected, rtol=1e-12)
 
 
-def test_derivatives_in_every_parameter_are_those_of_differences(found):
-    guess, slope, slopes, _ = found
+def test_derivatives_by_all_parameters_match_finite_differences(reference_results):
+    guess, slope, slopes, _ = reference_results
     for name in ("d", "kappa", "r", "gamma"):
         step = 1e-3 * np.maximum(np.abs(getattr(guess.pair, name)), 0.05)
 
@@ -74,19 +81,19 @@ def test_derivatives_in_every_parameter_are_those_of_differences(found):
             return np.stack([state.P, state.speed], axis=1)
 
         difference = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step[:, None])
-        # Gravity splits the equal speeds of a symmetric orbit: their largest has a kink there.
+        # Gravity splits the equal speeds of a symmetric orbit: the largest speed has a kink there.
         smooth = slice(0, 1) if name == "gamma" else slice(None)
-        mine, wanted = getattr(slopes, name)[:, smooth], difference[:, smooth]
-        np.testing.assert_allclose(mine, wanted, rtol=2e-6, atol=1e-9, err_msg=name)
+        actual, expected = getattr(slopes, name)[:, smooth], difference[:, smooth]
+        np.testing.assert_allclose(actual, expected, rtol=2e-6, atol=1e-9, err_msg=name)
 
 
 @pytest.mark.long
-def test_reverse_is_forward_and_second_derivatives_are_differences_of_first(found):
-    guess, slope, slopes, _ = found
-    one, pair = guess[1], jax.tree.map(lambda x: x[1], guess.pair)
+def test_reverse_mode_and_second_derivatives_match_forward_mode(reference_results):
+    guess, slope, slopes, _ = reference_results
+    orbit, pair = guess[1], jax.tree.map(lambda x: x[1], guess.pair)
 
     def P(kappa):
-        return of_pair(dataclasses.replace(pair, kappa=kappa), one)[0][0]
+        return power_and_speed(dataclasses.replace(pair, kappa=kappa), orbit)[0][0]
 
     value, second = jax.jit(lambda kappa: jax.jvp(jax.grad(P), (kappa,), (jnp.ones_like(kappa),)))(pair.kappa)
     assert float(value) == pytest.approx(float(slopes.kappa[1, 0]), rel=1e-12)
@@ -101,49 +108,49 @@ def test_reverse_is_forward_and_second_derivatives_are_differences_of_first(foun
 
 
 @pytest.mark.long
-def test_what_pads_an_orbit_changes_nothing(found):
+def test_padding_of_an_orbit_does_not_change_its_steady_state(reference_results):
     """Orbits of several widths are padded with NaN."""
-    guess, slope, slopes, state = found
-    padded = periodic.widened(guess, 4)
-    assert np.isnan(padded.knots[:, 2:]).all()
+    guess, slope, slopes, state = reference_results
+    padded = periodic.pad_orbits(guess, 4)
+    assert np.isnan(padded.impact_unknowns[:, 2:]).all()
     wide_slopes, wide_state = slope(padded.pair, padded)
     for wide, narrow in zip(jax.tree.leaves(wide_slopes), jax.tree.leaves(slopes), strict=True):
         np.testing.assert_allclose(wide, narrow, rtol=1e-12, atol=1e-18)
     for name in ("P", "speed", "multiplier", "condition"):
         np.testing.assert_allclose(getattr(wide_state, name), getattr(state, name), rtol=1e-12)
     np.testing.assert_array_equal(wide_state.depth[:, 2:], 0)
-    assert np.isfinite(wide_state.knots).all()
+    assert np.isfinite(wide_state.impact_unknowns).all()
 
 
-def test_where_no_orbit_attracts_nothing_is_said(found):
-    guess, slope, _, _ = found
-    every = orbit_search.search(impact_pair(0.2, 25.0, 0.5), "RL", guesses=64)
-    repels = every[np.flatnonzero(np.abs(every.multipliers[:, 0]) > 1.01)[[0, 0, 0, 0]]]
-    nonsense = dataclasses.replace(guess, knots=guess.knots * jnp.array([1.0, 1.0, -1.0]))
-    for orbit, wanted in ((repels, Status.UNSTABLE), (nonsense, Status.NO_ORBIT)):
+def test_steady_state_is_nan_where_no_orbit_attracts(reference_results):
+    guess, slope, _, _ = reference_results
+    orbits = orbit_search.find_orbits(impact_pair(0.2, 25.0, 0.5), "RL", guesses=64)
+    repelling = orbits[np.flatnonzero(np.abs(orbits.multipliers[:, 0]) > 1.01)[[0, 0, 0, 0]]]
+    nonsense = dataclasses.replace(guess, impact_unknowns=guess.impact_unknowns * jnp.array([1.0, 1.0, -1.0]))
+    for orbit, expected in ((repelling, Status.UNSTABLE), (nonsense, Status.NO_ORBIT)):
         slopes, state = slope(orbit.pair, orbit)
-        np.testing.assert_array_equal(state.status, wanted)
+        np.testing.assert_array_equal(state.status, expected)
         for leaf in (state.P, state.power, state.speed, *jax.tree.leaves(slopes)):
             assert np.isnan(leaf).all()
 
 
-def test_a_rigid_wall_yields_by_the_depth_it_is_lent():
-    start = orbit_search.search(impact_pair(0.3, None, 0.5), "RL", guesses=64)
-    index = int(np.abs(start.multipliers[:, 0]).argmin())
-    one = start[index]
+def test_power_of_rigid_walls_uses_the_depth_of_the_formula():
+    orbits = orbit_search.find_orbits(impact_pair(0.3, None, 0.5), "RL", guesses=64)
+    index = int(np.abs(orbits.multipliers[:, 0]).argmin())
+    orbit = orbits[index]
 
     def P(r):
-        pair = ImpactPair(one.pair.d, None, r, one.pair.gamma)
-        return steady(DEVICE, one, pair=pair).P
+        pair = ImpactPair(orbit.pair.d, None, r, orbit.pair.gamma)
+        return steady(DEVICE, orbit, pair=pair).P
 
     value = jax.jit(P)
-    assert float(value(0.5)) == pytest.approx(float(orbit_properties.power(start, DEVICE)[index]), rel=1e-12)
+    assert float(value(0.5)) == pytest.approx(float(orbit_properties.orbit_power(orbits, DEVICE)[index]), rel=1e-12)
     difference = (8 * (value(0.501) - value(0.499)) - (value(0.502) - value(0.498))) / 0.012
     assert float(jax.jit(jax.jacfwd(P))(0.5)) == pytest.approx(float(difference), rel=1e-7)
 
 
-def test_several_cells_or_devices_are_refused_with_what_to_do(found):
-    orbit = jax.tree.map(lambda x: x[0], found[0])
+def test_several_cells_or_devices_raise_with_advice(reference_results):
+    orbit = jax.tree.map(lambda x: x[0], reference_results[0])
     cells = impact_pair(np.full((2, 2), 0.2), 400.0, 0.5)
     with pytest.raises(ValueError, match=r"pair must be one cell; got d of shape \(2, 2\); map several by jax.vmap"):
         steady(DEVICE, orbit, pair=cells)
@@ -151,39 +158,39 @@ def test_several_cells_or_devices_are_refused_with_what_to_do(found):
         steady(Harvester(s=[0.2, 0.3]), orbit)
 
 
-def test_a_record_prints_its_status_by_name_and_what_to_do():
-    # The symmetric 1:1 orbit of a rigid wall repels beyond its flip at d = 0.187.
-    found = orbit_search.search(impact_pair(0.15, None, 0.5), "RL", guesses=64)
-    state = steady(DEVICE, found[0], pair=jax.tree.map(lambda x: x[0], found.pair))
+def test_steady_state_prints_its_status_by_name_with_advice():
+    # The symmetric 1:1 orbit of a rigid wall repels below its flip at d = 0.187.
+    orbits = orbit_search.find_orbits(impact_pair(0.15, None, 0.5), "RL", guesses=64)
+    state = steady(DEVICE, orbits[0], pair=jax.tree.map(lambda x: x[0], orbits.pair))
     assert int(state.status) == Status.UNSTABLE
     assert "status=<Status.UNSTABLE: 9, follow it as a branch" in repr(state).replace("\n", " ")
-    assert f"'OK': {len(found)}" in repr(found)
+    assert f"'OK': {len(orbits)}" in repr(orbits)
     assert "status=" in repr(jax.eval_shape(lambda: state))
     assert all(status.advice for status in Status)
 
 
 @pytest.fixture(scope="module")
-def pressed():
-    """Period-1 orbits that end a chatter pressed on a wall, through a contact of many turning points."""
+def long_contacts():
+    """Return period-1 orbits with a chatter that ends in a gravity-prolonged contact of many turning points."""
     rows = json.loads((Path(__file__).parents[1] / "data" / "long_contacts.json").read_text())
     width = 16
     pair = impact_pair(*(np.array([row[name] for row in rows]) for name in ("d", "kappa", "r", "gamma")))
-    side, knots = np.zeros((len(rows), width), np.int32), np.zeros((len(rows), width, 3))
+    side, impact_unknowns = np.zeros((len(rows), width), np.int32), np.zeros((len(rows), width, 3))
     for index, row in enumerate(rows):
-        side[index, : len(row["side"])], knots[index, : len(row["side"])] = row["side"], row["knots"]
+        side[index, : len(row["side"])], impact_unknowns[index, : len(row["side"])] = row["side"], row["knots"]
     sequence = Sequence(jnp.asarray(side), jnp.full(len(rows), 2.0, float), jnp.zeros(len(rows), bool))
-    return pair, sequence, jnp.asarray(knots)
+    return pair, sequence, jnp.asarray(impact_unknowns)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("off", [1.0, 1.05])
-def test_a_pressed_contact_is_what_the_impact_map_flies(pressed, off):
-    pair, sequence, knots = pressed
-    pair = dataclasses.replace(pair, d=off * pair.d)
-    flown = periodic.solve(pair, sequence, knots)
-    state = jax.jit(jax.vmap(lambda orbit: steady(DEVICE, orbit, pair=orbit.pair)))(flown)
-    # Off its place one of them would meet the wall twice more: that is no orbit, whatever its equations say.
-    np.testing.assert_array_equal(state.status, flown.status)
-    assert (np.asarray(flown.status) == Status.VIRTUAL).sum() == (off != 1.0)
-    good = np.asarray(flown.status) == Status.OK
-    np.testing.assert_allclose(state.P[good], orbit_properties.power(flown, DEVICE)[good], rtol=1e-12)
+@pytest.mark.parametrize("factor", [1.0, 1.05])
+def test_steady_state_of_long_contacts_matches_the_impact_map(long_contacts, factor):
+    pair, sequence, impact_unknowns = long_contacts
+    pair = dataclasses.replace(pair, d=factor * pair.d)
+    orbits = periodic.solve(pair, sequence, impact_unknowns)
+    state = jax.jit(jax.vmap(lambda orbit: steady(DEVICE, orbit, pair=orbit.pair)))(orbits)
+    # At the larger gap one solution of the equations would reach the wall twice more: this orbit is virtual.
+    np.testing.assert_array_equal(state.status, orbits.status)
+    assert (np.asarray(orbits.status) == Status.VIRTUAL).sum() == (factor != 1.0)
+    good = np.asarray(orbits.status) == Status.OK
+    np.testing.assert_allclose(state.P[good], orbit_properties.orbit_power(orbits, DEVICE)[good], rtol=1e-12)

@@ -1,4 +1,4 @@
-"""Claims of the paper, each as `tests/data/claims.json` has it after correction; the cheap ones."""
+"""Claims of the paper that are fast to check, with the corrected values of `tests/data/claims.json`."""
 
 import json
 import math
@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 
 from vijax import impact_pair, sweep
-from vijax.batch import simulate
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
+from vijax.simulation import simulate
 
 CLAIMS = {c["id"]: c for c in json.loads((Path(__file__).parents[1] / "data" / "claims.json").read_text())}
 TABLE_2 = Harvester()
 STARTS = [(u, v) for u in (-0.04, 0.0, 0.04) for v in (-0.6, -0.47898, -0.3, 0.3, 0.5)]
-# The smallest tile of a plane, whose programs serve here, too, where the device is named as planes name it.
+# The smallest tile of a map; with the device passed as maps pass it, the tests use the compiled programs of maps.
 TILE = 1024
 
 
 def attractors(gaps, kappa=None, r=0.5):
-    """What every start ends on, for each gap: rows (left, right, period, P, speeds) with mirror images merged."""
+    """Return, for each gap, the labels and powers of the attractors of all starts, with mirror images merged."""
     d, index = np.repeat(gaps, len(STARTS)), np.tile(np.arange(len(STARTS)), len(gaps))
     u0, v0 = np.array(STARTS)[index].T
     count = d.size
@@ -31,31 +31,31 @@ def attractors(gaps, kappa=None, r=0.5):
     def column(x):
         return jnp.asarray(np.resize(np.broadcast_to(x, count), TILE) * 1.0)
 
-    one = jnp.ones(TILE)
-    # The engine's depth on a rigid wall is that of kappa = 1.
-    unit = one if kappa is not None else one / (TABLE_2.omega0 * math.pi / TABLE_2.omega)
-    found = simulate.summarise(
+    unity = jnp.ones(TILE)
+    # The simulated depth at a rigid wall is the depth at kappa = 1.
+    unit = unity if kappa is not None else unity / (TABLE_2.omega0 * math.pi / TABLE_2.omega)
+    summary = simulate.summarise(
         ImpactPair(column(d), None if kappa is None else column(kappa), column(r), column(0.0)),
         column(u0),
         column(v0),
-        simulate.Scale(unit, one, jnp.ones(1), jnp.ones(1)),
+        simulate.Scale(unit, unity, jnp.ones(1), jnp.ones(1)),
         TABLE_2,
         outputs=frozenset({"P"}),
         count=count,
         on=jax.devices()[0],
     )
-    found = jax.tree.map(lambda leaf: np.asarray(leaf)[:count].reshape(len(gaps), len(STARTS), -1), found)
-    return [row(found, i) for i in range(len(gaps))]
+    summary = jax.tree.map(lambda leaf: np.asarray(leaf)[:count].reshape(len(gaps), len(STARTS), -1), summary)
+    return [row(summary, i) for i in range(len(gaps))]
 
 
-def row(found, i):
-    """Labels n:m/pT of the starts at one gap, the smaller count first, and their powers."""
+def row(summary, i):
+    """Return the labels n:m/pT of the starts at a gap, the smaller count first, and their powers."""
     names = []
     for j in range(len(STARTS)):
-        low, high = sorted((int(found.impacts_left[i, j, 0]), int(found.impacts_right[i, j, 0])))
-        p = int(found.period[i, j, 0])
-        names.append("slow" if found.status[i, j, 0] == Status.SLOW else f"{low}:{high}/{p}T")
-    return np.array(names), found.P[i, :, 0]
+        low, high = sorted((int(summary.impacts_left[i, j, 0]), int(summary.impacts_right[i, j, 0])))
+        p = int(summary.period[i, j, 0])
+        names.append("slow" if summary.status[i, j, 0] == Status.SLOW else f"{low}:{high}/{p}T")
+    return np.array(names), summary.P[i, :, 0]
 
 
 RIGID = [0.16, 0.18, 0.182, 0.186, 0.19, 0.2, 0.21, 0.25, 0.28, 0.3]
@@ -67,9 +67,9 @@ def rigid():
 
 
 def test_t2_damping_of_table_2():
-    claim = CLAIMS["T2-mu"]
-    assert float(TABLE_2.pair().mu) == pytest.approx(claim["oracle_accurate"], rel=1e-10)
-    assert float(impact_pair(d=0.3, kappa=400, r=0.5).mu) == pytest.approx(claim["paper"], abs=5e-3)
+    reference = CLAIMS["T2-mu"]
+    assert float(TABLE_2.pair().mu) == pytest.approx(reference["oracle_accurate"], rel=1e-10)
+    assert float(impact_pair(d=0.3, kappa=400, r=0.5).mu) == pytest.approx(reference["paper"], abs=5e-3)
 
 
 @pytest.mark.parametrize("d", [0.21, 0.25, 0.28, 0.3])
@@ -123,7 +123,7 @@ def test_e1_soft_walls_near_the_rigid_limit_give_the_same_energy():
 @pytest.mark.long
 def test_f11b_asymmetric_one_to_one():
     ds = sweep(d=0.12, kappa=np.array([10.5, 12.65]), outputs=("period", "restitution_left", "restitution_right"))
-    gap = np.abs(ds.restitution_left - ds.restitution_right).values
+    difference = np.abs(ds.restitution_left - ds.restitution_right).values
     assert list(ds.period.values) == [1, 1]
-    assert gap[0] < 1e-9
-    assert gap[1] > 1e-2
+    assert difference[0] < 1e-9
+    assert difference[1] > 1e-2

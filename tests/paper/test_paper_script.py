@@ -1,4 +1,4 @@
-"""`scripts/paper`: which figures it draws and where, the table of claims, and nothing at all after bad input."""
+"""`scripts/paper`: the drawn figures and their files, the table of claims, and no output after bad input."""
 
 import pytest
 
@@ -8,16 +8,16 @@ from vijax.cli import process
 
 
 @pytest.fixture
-def drawn(tmp_path, monkeypatch):
-    """Numbers and files instead of pictures."""
+def draw_calls(tmp_path, monkeypatch):
+    """Record the numbers and files of figures instead of drawing them."""
     monkeypatch.chdir(tmp_path)
-    asked = []
-    monkeypatch.setattr(figures, "draw", lambda number, file: asked.append((number, str(file))))
-    return asked
+    calls = []
+    monkeypatch.setattr(figures, "draw", lambda number, file: calls.append((number, str(file))))
+    return calls
 
 
 @pytest.mark.parametrize(
-    ("arguments", "say"),
+    ("arguments", "message"),
     [
         ([], "figure must be given unless --claims is"),
         (["--figure", "2"], "figure must be all, or among 3, 4, 5"),
@@ -25,23 +25,23 @@ def drawn(tmp_path, monkeypatch):
         (["--figure", "3", "--into", "nowhere"], "folder that exists"),
     ],
 )
-def test_bad_input_draws_nothing(drawn, capsys, arguments, say):
+def test_bad_input_draws_nothing(draw_calls, capsys, arguments, message):
     assert process.run(script.paper, arguments) == 2
-    assert say in capsys.readouterr().err
-    assert not drawn
+    assert message in capsys.readouterr().err
+    assert not draw_calls
 
 
-def test_all_figures_and_some(drawn):
+def test_all_or_selected_figures_are_drawn(draw_calls):
     assert process.run(script.paper, ["--figure", "3, 16"]) == 0
-    assert drawn == [(3, "figure_3.png"), (16, "figure_16.png")]
-    drawn.clear()
+    assert draw_calls == [(3, "figure_3.png"), (16, "figure_16.png")]
+    draw_calls.clear()
     assert process.run(script.paper, ["--figure", "all"]) == 0
-    assert [number for number, _ in drawn] == list(range(3, 17))
+    assert [number for number, _ in draw_calls] == list(range(3, 17))
 
 
-def test_claims_are_printed_and_written(drawn, tmp_path, monkeypatch, capsys):
+def test_claims_are_printed_and_written(draw_calls, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(claims, "CLAIMS", {"T2-mu": claims.CLAIMS["T2-mu"]})
     assert process.run(script.paper, ["--claims"]) == 0
     assert "verdict    reproduced" in capsys.readouterr().out
     assert (tmp_path / "claims.md").read_text().rstrip().endswith("| 172.363 | 172.36301 | 172.36301 | reproduced |")
-    assert process.run(script.paper, ["--claims"]) == 2  # it is there
+    assert process.run(script.paper, ["--claims"]) == 2  # claims.md exists

@@ -1,4 +1,4 @@
-"""Small multiples: what is drawn where, walls, marks, legend and caption."""
+"""Small multiples: places of panels, walls, reference lines, legend and caption."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ PLANE = phase_plane("$d = 0.2$", [Layer(np.cos(CIRCLE), np.sin(CIRCLE), "black",
 SWEEP = Panel("", "$d$", "speed", [Layer([0.1, 0.2], [[1.0, np.nan], [2.0, 3.0]][0], "tab:blue", "dots", "soft")])
 
 
-def test_every_panel_is_drawn_in_its_place(tmp_path):
+def test_panels_are_drawn_in_their_places(tmp_path):
     file = tmp_path / "figure.png"
     figure = small_multiples({"a": SWEEP, "b": PLANE}, ("aab",), "Fig. 0. Two panels.", file)
     assert file.read_bytes().startswith(b"\x89PNG")
@@ -25,13 +25,13 @@ def test_every_panel_is_drawn_in_its_place(tmp_path):
     assert legend.get_title().get_text() == "Fig. 0. Two panels."
 
 
-def test_walls_stand_at_half_the_gap():
+def test_walls_are_drawn_at_half_the_gap():
     plane = small_multiples({"a": PLANE}, ("a",)).axes[0]
     walls = [line.get_xdata()[0] for line in plane.lines if line.get_color() == "firebrick"]
     assert sorted(walls) == [-0.1, 0.1]
 
 
-def test_marks_and_scales():
+def test_reference_lines_and_scales():
     panel = SWEEP._replace(upright=(0.12, 0.2), level=[(1.5, "tab:blue")], log="x", span=(0.05, 0.3))
     axes = small_multiples({"a": panel}, ("a",)).axes[0]
     assert (axes.get_xscale(), axes.get_yscale(), axes.get_xlim()) == ("log", "linear", (0.05, 0.3))
@@ -44,10 +44,10 @@ def test_a_continued_panel_has_no_letter():
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["(a) $d = 0.2$", "$d = 0.2$"]
 
 
-def test_a_ball_at_rest_in_the_frame_of_the_ground_goes_straight():
+def test_ball_at_rest_in_the_frame_of_the_ground_is_a_straight_line():
     t = np.linspace(0.0, 4.0, 81)
-    still = Curve(t, -np.cos(np.pi * t) / np.pi**2, np.sin(np.pi * t) / np.pi)
-    panel = time_series("", still, ([1.0], [0.1]), 0.2)
+    curve = Curve(t, -np.cos(np.pi * t) / np.pi**2, np.sin(np.pi * t) / np.pi)
+    panel = time_series("", curve, ([1.0], [0.1]), 0.2)
     *walls, ball, rings = panel.layers
     np.testing.assert_allclose(ball.y, 0.0, atol=1e-15)
     assert [float(wall.y[0]) for wall in walls] == pytest.approx([0.1 + np.pi**-2, -0.1 + np.pi**-2])

@@ -1,19 +1,19 @@
-"""Pictures of designs: the optimum, its band, what is not physical and where, from made-up diagrams and reports."""
+"""Pictures of designs from artificial diagrams and reports: the optimum, its tolerance band, unphysical ranges."""
 
 import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.colors import to_rgba
 
-from vijax.design.tolerance import Tolerance
-from vijax.design.tolerance_plane import NearestPoint, TolerancePlane
+from vijax.design.robustness.tolerance import Tolerance
+from vijax.design.robustness.tolerance_plane import NearestPoint, TolerancePlane
 from vijax.plots import designs, save
 
 GREEN = to_rgba(designs._STAR["color"])
 
 
 def diagram(along="omega0", bounds=(20.0, 60.0)) -> xr.Dataset:
-    """P = 1 uJ everywhere, 9 uJ and inadmissible in the fourth point; rising, the last point yields nothing."""
+    """Return a diagram: P is 1 uJ, at the fourth point 9 uJ and inadmissible, and upward 0 at the last point."""
     x = np.linspace(*bounds, 9)
     power = np.full((2, 9), 1e-6)
     power[:, 3], power[1, 8] = 9e-6, 0.0
@@ -35,13 +35,13 @@ def report(**changed):
         "active": [],
         "stopped": "maximum",
         "path": [[58.0], [52.0], [50.0]],
-        "heights": [0.5e-6, 0.9e-6, 1e-6],
+        "path_objective": [0.5e-6, 0.9e-6, 1e-6],
     }
     edges = {"below": {"kind": "fold", "omega0": 45.0}, "above": {"kind": "none", "omega0": 75.0}}
     highest = {"along": "omega0", "value": 35.0, "P": 9e-6, "admissible": False, "max_penetration": 0.02}
-    whole = {"best": best, "tune": ["omega0"], "objective": "P", "surroundings": edges, "highest": highest}
-    whole["extents"] = []
-    return whole | {"tolerances": [{"name": "omega0", "spread": 0.05, "kind": "uniform"}], "spread": None} | changed
+    contents = {"best": best, "tune": ["omega0"], "objective": "P", "surroundings": edges, "highest": highest}
+    contents["parameter_ranges"] = []
+    return contents | {"tolerances": [{"name": "omega0", "spread": 0.05, "kind": "uniform"}], "spread": None} | changed
 
 
 def words(figure) -> list[str]:
@@ -49,16 +49,16 @@ def words(figure) -> list[str]:
 
 
 def line(axes, label):
-    (found,) = [one for one in axes.get_lines() if str(one.get_label()).startswith(label)]
-    return found
+    (match,) = [artist for artist in axes.get_lines() if str(artist.get_label()).startswith(label)]
+    return match
 
 
 def span(axes, label):
-    (found,) = [one for one in axes.patches if one.get_label() == label]
-    return pytest.approx((found.get_x(), found.get_x() + found.get_width()))
+    (match,) = [artist for artist in axes.patches if artist.get_label() == label]
+    return pytest.approx((match.get_x(), match.get_x() + match.get_width()))
 
 
-def test_the_optimum_its_band_its_edge_and_the_ascent_are_where_the_report_says(tmp_path):
+def test_optimum_band_edge_and_ascent_agree_with_the_report(tmp_path):
     figure = designs.design(diagram(), report())
     save(figure, tmp_path / "design.png")
     assert (tmp_path / "design.png").stat().st_size > 0
@@ -70,38 +70,38 @@ def test_the_optimum_its_band_its_edge_and_the_ascent_are_where_the_report_says(
     assert figure.axes[1].get_xlim() == pytest.approx(designs.close_view("omega0", 50.0))
 
 
-def test_how_far_the_motion_lasts_and_averages_of_chaos_are_shown():
-    side = {"percent": 4.0, "lasts": False, "label": "aperiodic", "P": 1e-6, "admissible": True}
-    extents = [{"name": "omega0", "below": side, "above": side | {"percent": 10.0, "lasts": True}}]
+def test_range_of_the_motion_and_chaotic_averages_are_drawn():
+    side = {"percent": 4.0, "persists": False, "label": "aperiodic", "P": 1e-6, "admissible": True}
+    parameter_ranges = [{"name": "omega0", "below": side, "above": side | {"percent": 10.0, "persists": True}}]
     chaos = diagram()
     chaos["P_stderr"] = 0.01 * chaos["P"]
-    # Kinds of motion: chaos at the sixth point and, falling alone, at the last, which is inadmissible.
+    # The motion is chaotic at the sixth point and, downward only, at the inadmissible last point.
     chaos["period"] = chaos["P"].astype(int) * 0 + 1
     chaos["period"][:, 5], chaos["period"][0, 8] = 0, 0
-    upper, _ = designs.design(chaos, report(extents=extents)).axes
-    assert span(upper, "as far as this motion lasts") == (48.0, 55.0)
+    upper, _ = designs.design(chaos, report(parameter_ranges=parameter_ranges)).axes
+    assert span(upper, "range of this motion") == (48.0, 55.0)
     np.testing.assert_allclose(line(upper, "average of chaos").get_xdata(), [45.0, 45.0])
-    assert "as far as this motion lasts" not in words(designs.design(diagram(), report()))
+    assert "range of this motion" not in words(designs.design(diagram(), report()))
 
 
-def test_what_an_optimiser_without_constraints_would_report_is_marked_and_its_range_veiled():
+def test_unconstrained_maximum_is_marked_and_its_range_hatched():
     figure = designs.design(diagram(), report())
-    naive = line(figure.axes[0], "what $P$ alone would choose")
+    naive = line(figure.axes[0], "unconstrained maximum of $P$")
     np.testing.assert_allclose(naive.get_xydata(), [[35, 9e-6]])
     assert "9 $\\mu$J, 20 mm deep" in naive.get_label()
     assert span(figure.axes[0], "inadmissible") == (32.5, 37.5)
-    # The last point is veiled too: what is admissible there yields nothing.
-    veils = [one for one in figure.axes[0].patches if one.get_hatch()]
-    assert [one.get_x() for one in veils] == pytest.approx([32.5, 57.5])
+    # The last point is hatched, too: its admissible motion yields no power.
+    hatched = [patch for patch in figure.axes[0].patches if patch.get_hatch()]
+    assert [patch.get_x() for patch in hatched] == pytest.approx([32.5, 57.5])
 
 
-def test_nothing_unphysical_is_shown_where_the_optimum_is_the_highest():
+def test_no_unphysical_point_is_drawn_if_the_optimum_is_the_highest():
     highest = report()["highest"] | {"P": 0.5e-6}
     assert not [word for word in words(designs.design(diagram(), report(highest=highest))) if "alone" in word]
 
 
-def test_the_edge_and_the_band_move_with_the_square_in_k():
-    best = report()["best"] | {"values": {"k": 8.75}, "path": [[9.0], [8.75]], "heights": [0.9e-6, 1e-6]}
+def test_edge_and_band_in_k_are_those_of_the_squared_frequency():
+    best = report()["best"] | {"values": {"k": 8.75}, "path": [[9.0], [8.75]], "path_objective": [0.9e-6, 1e-6]}
     axes = designs.design(diagram("k", (5.0, 12.0)), report(best=best, tune=["k"])).axes[0]
     assert span(axes, "tolerance") == (8.75 * 0.95**2, 8.75 * 1.05**2)
     np.testing.assert_allclose(line(axes, "fold").get_xdata(), 8.75 * 0.9**2)
@@ -113,33 +113,33 @@ def test_without_an_optimum_the_curves_remain():
     assert "optimum" not in " ".join(words(figure))
 
 
-def test_a_map_of_designs_colours_them_by_what_holds_them(tmp_path):
+def test_design_map_is_coloured_by_active_limits(tmp_path):
     worst = {"spread": {"worst": 0.2e-6}}
-    held = [report(**worst), report(best=None), report(**worst), report(**worst)]
-    held[0]["best"]["active"] = ["penetration limit at the right wall"]
-    held[3]["best"]["stopped"] = "stalled"
-    found = {"over": {"name": "d", "values": [0.1, 0.2, 0.3, 0.4]}, "designs": held}
-    figure = designs.design_map(found)
+    reports = [report(**worst), report(best=None), report(**worst), report(**worst)]
+    reports[0]["best"]["active"] = ["penetration limit at the right wall"]
+    reports[3]["best"]["stopped"] = "stalled"
+    map_report = {"over": {"name": "d", "values": [0.1, 0.2, 0.3, 0.4]}, "designs": reports}
+    figure = designs.design_map(map_report)
     save(figure, tmp_path / "map.png")
     assert (tmp_path / "map.png").stat().st_size > 0
     upper, lower = figure.axes
     assert words(figure) == [
         "penetration limit",
         "a kink, or all evaluations spent",
-        "nothing: interior",
+        "no active limit",
         "worst within the tolerances",
     ]
-    assert [one.get_xydata().tolist() for one in upper.get_lines() if one.get_xdata().size] == [
+    assert [artist.get_xydata().tolist() for artist in upper.get_lines() if artist.get_xdata().size] == [
         [[0.1, 50]],
         [[0.4, 50]],
         [[0.3, 50]],
     ]
-    interior = line(lower, "nothing: interior")
+    interior = line(lower, "no active limit")
     assert interior.get_xydata().tolist() == [[0.3, 1e-6]]
     assert to_rgba(interior.get_color()) == GREEN
 
 
-def test_a_picture_of_another_kind_is_refused(tmp_path):
+def test_unsupported_file_type_raises(tmp_path):
     with pytest.raises(ValueError, match="plot must end in"):
         save(designs.design(diagram(), report()), tmp_path / "picture.txt")
     assert not list(tmp_path.iterdir())
@@ -154,7 +154,7 @@ def test_the_plane_of_two_tolerances_shows_the_optimum_in_its_box(tmp_path):
     assert (axes.get_xlim(), axes.get_ylim()) == (within["omega0"], within["s"])
     (box,) = axes.patches
     assert box.get_bbox().bounds == pytest.approx((47.5, 0.00588, 5.0, 0.00024))
-    places = [tuple(float(x) for one in line.get_data() for x in np.ravel(one)) for line in axes.lines]
+    places = [tuple(float(x) for coordinates in line.get_data() for x in np.ravel(coordinates)) for line in axes.lines]
     assert places == [near.values, (50.0, 0.006)]
     assert "nearest bifurcation, limit" in words(figure)
     save(figure, tmp_path / "design.png")

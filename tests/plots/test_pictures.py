@@ -1,6 +1,6 @@
-"""Pictures of made-up results look as they did: pixel by pixel, but for what another build of the fonts may change.
+"""Pictures of artificial results equal the stored pictures, except for small differences of font builds.
 
-One that is to look otherwise is drawn anew, and looked at, by `python tests/plots/test_pictures.py`.
+After an intended change, `python tests/plots/test_pictures.py` draws the stored pictures again; inspect them.
 """
 
 from pathlib import Path
@@ -18,10 +18,11 @@ from vijax.model.records import Status
 from vijax.plots.style import STYLE
 
 STORED = Path(__file__).parents[1] / "data" / "pictures"
-DOTS = 40  # an inch
-SEEN = 32  # levels of 255 by which a pixel must differ to count
-# Of the pixels. Another colour of one line of dots changes 0.006 of them; limits, a title or a mark 0.07 and more.
-SHARE = 0.002
+DOTS = 40  # dots per inch
+MIN_DIFFERENCE = 32  # levels of 255 by which a pixel must differ to count
+# Largest share of different pixels. Another colour of a line of dots changes a share of 0.006; limits, a title or a
+# mark change 0.07 and more.
+MAX_SHARE = 0.002
 D, KAPPA = np.linspace(0.05, 0.3, 12), np.geomspace(3, 400, 16)
 
 
@@ -30,7 +31,7 @@ def coordinate(name: str, symbol: str, values) -> tuple:
 
 
 def plane() -> xr.Dataset:
-    """Power in a ridge, inadmissible at great d; 1:1 with stripes of 2:1/2T, chaos, and cells without an answer."""
+    """Return a map: power with a ridge, inadmissible at large d; 1:1, stripes of 2:1/2T, chaos, undecided cells."""
     d, kappa = np.meshgrid(np.linspace(0, 1, D.size), np.linspace(0, 1, KAPPA.size), indexing="ij")
     period = np.select([d + kappa < 0.3, kappa > 0.8, d > 0.7], [-1, 0, 2], 1)
     dims = ("d", "kappa")
@@ -54,19 +55,19 @@ def plane() -> xr.Dataset:
 
 
 def starts() -> xr.Dataset:
-    """Two attractors whose basins lie around each other."""
+    """Return two attractors with interleaved basins."""
     u, v = np.linspace(-0.1, 0.1, 20), np.linspace(-0.6, 0.6, 24)
     basin = (np.sin(40 * u[:, None] + 9 * v) > 0).astype(int)
     table = {"label": ["1:2/2T", "1:1"], "P": [4e-3, 1e-6], "starts": [240, 240], "fraction": [0.5, 0.5]}
     table["periods_run"] = [50.0, 40.0]
     place = {"u0": coordinate("u0", "u_0", u), "v0": coordinate("v0", "v_0", v)}
     place["gamma"] = ((), 0.0, {"symbol": r"\gamma", "units": "1"})
-    found = {name: ("attractor", np.array(column)) for name, column in table.items()}
-    return xr.Dataset(found | {"basin": (("u0", "v0"), basin), "attractors": 2}, place, {"wall": "soft"})
+    variables = {name: ("attractor", np.array(column)) for name, column in table.items()}
+    return xr.Dataset(variables | {"basin": (("u0", "v0"), basin), "attractors": 2}, place, {"wall": "soft"})
 
 
 def cascade() -> xr.Dataset:
-    """The logistic map in the place of impact speeds, up and down."""
+    """Return an orbit diagram with the logistic map in place of impact speeds, downward and upward."""
     a = np.linspace(0.1, 0.3, 60)
     x = np.full(a.size, 0.3)
     speeds = [x := (3 + (a - 0.1) * 5) * x * (1 - x) for _ in range(220)][-20:]
@@ -105,13 +106,13 @@ def pixels(figure: Figure) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_a_picture_looks_as_it_did(name, tmp_path):
+def test_picture_equals_the_stored_picture(name, tmp_path):
     drawn = pixels(PICTURES[name]())
     stored = np.round(255 * imread(STORED / f"{name}.png")[..., :3])
     assert drawn.shape == stored.shape
-    differs = (np.abs(drawn - stored) > SEEN).any(axis=-1)
+    differs = (np.abs(drawn - stored) > MIN_DIFFERENCE).any(axis=-1)
     imsave(tmp_path / "drawn.png", drawn)
-    assert differs.mean() < SHARE, f"look at {tmp_path}/drawn.png"
+    assert differs.mean() < MAX_SHARE, f"look at {tmp_path}/drawn.png"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Programs are kept for the next process, in a folder of the user's that stays small and that nobody else can write."""
+"""Programs are stored for later processes, in a small folder of the user that no other user can write."""
 
 import os
 import stat
@@ -9,9 +9,9 @@ import time
 import jax
 import pytest
 
-from vijax.runtime import cache_folder
+from vijax.runtime.compilation import cache_folder
 
-FLIES = """
+SIMULATES = """
 import sys, pathlib, vijax, jax
 folder = pathlib.Path(sys.argv[1])
 assert folder.exists() == (sys.argv[2] == "again"), "importing writes nothing"
@@ -26,34 +26,36 @@ print(counts["cache_hits"], counts["cache_misses"])
 """
 
 
-def flown(folder, when="first", **environment):
-    """How many programs a new process found, and how many it compiled, with the user's caches in a folder."""
-    told = {name: value for name, value in os.environ.items() if "JAX_" not in name} | {"XDG_CACHE_HOME": str(folder)}
-    command = [sys.executable, "-c", FLIES, str(folder / "vijax"), when]
-    done = subprocess.run(command, env=told | environment, capture_output=True, text=True, check=False)
-    assert not done.returncode, done.stderr
-    return tuple(map(int, done.stdout.split()))
+def cache_counts(folder, when="first", **environment):
+    """Return how many programs a new process reads and how many it compiles, with the user's caches in a folder."""
+    variables = {name: value for name, value in os.environ.items() if "JAX_" not in name} | {
+        "XDG_CACHE_HOME": str(folder)
+    }
+    command = [sys.executable, "-c", SIMULATES, str(folder / "vijax"), when]
+    result = subprocess.run(command, env=variables | environment, capture_output=True, text=True, check=False)
+    assert not result.returncode, result.stderr
+    return tuple(map(int, result.stdout.split()))
 
 
-def test_a_process_finds_what_the_one_before_has_compiled(tmp_path):
-    hits, misses = flown(tmp_path)
+def test_a_process_reads_programs_compiled_by_an_earlier_process(tmp_path):
+    hits, misses = cache_counts(tmp_path)
     assert (hits, misses > 0) == (0, True)
     assert (tmp_path / "vijax").stat().st_mode & 0o777 == 0o700
-    again, more = flown(tmp_path, "again")
+    again, more = cache_counts(tmp_path, "again")
     assert again > 0
     assert more < misses
 
 
 @pytest.mark.parametrize("environment", [{"JAX_ENABLE_COMPILATION_CACHE": "0"}, {"JAX_COMPILATION_CACHE_DIR": "own"}])
-def test_what_jax_is_told_stands(tmp_path, environment):
+def test_settings_of_the_jax_cache_are_respected(tmp_path, environment):
     folder = tmp_path / "cache"
-    told = {name: str(tmp_path / value) if value == "own" else value for name, value in environment.items()}
-    flown(folder, **told)
+    variables = {name: str(tmp_path / value) if value == "own" else value for name, value in environment.items()}
+    cache_counts(folder, **variables)
     assert not folder.exists()
 
 
 def program(name):
-    """The name of a file as JAX gives it to a compiled program."""
+    """Return the file name that JAX gives to a compiled program."""
     return f"jit_{name}-{name[0] * 64}-cache"
 
 
@@ -61,8 +63,8 @@ def program(name):
 AGES = {"a": 300, "b": 200, "c": 100}
 
 
-def filled(folder):
-    """Make a folder of three programs, of which the second was read last."""
+def fill(folder):
+    """Make a folder of three programs; the second was read last."""
     now = time.time()
     folder.mkdir(exist_ok=True)
     for name, age in AGES.items():
@@ -75,8 +77,8 @@ def names(folder):
     return {path.name for path in folder.iterdir()}
 
 
-def test_the_oldest_programs_go(tmp_path):
-    filled(tmp_path)
+def test_trimming_deletes_the_oldest_programs(tmp_path):
+    fill(tmp_path)
     cache_folder.trim(tmp_path, 300)
     assert names(tmp_path) == {program(name) for name in "abc"}
     cache_folder.trim(tmp_path, 250)
@@ -85,7 +87,7 @@ def test_the_oldest_programs_go(tmp_path):
     assert names(tmp_path) == {program("b")}
 
 
-def test_traced_programs_and_those_half_written_go_too(tmp_path):
+def test_trimming_deletes_traced_and_partial_programs(tmp_path):
     digest = 64 * "d"
     for name in (f"traced-{digest}", f".traced-{digest}.123.part", f"jit_d-{digest}-atime"):
         (tmp_path / name).write_bytes(bytes(100))
@@ -96,7 +98,7 @@ def test_traced_programs_and_those_half_written_go_too(tmp_path):
 def test_no_other_file_is_deleted(tmp_path):
     others = (
         "thesis.tex",
-        "paces.json",
+        "costs.json",
         ".lockfile",
         "traced-",
         "model-cache",
@@ -109,109 +111,109 @@ def test_no_other_file_is_deleted(tmp_path):
     target.write_bytes(bytes(1000))
     (tmp_path / program("e")).symlink_to(target)
     (tmp_path / program("f")).mkdir()
-    filled(tmp_path)
+    fill(tmp_path)
     cache_folder.trim(tmp_path, 0)
     assert names(tmp_path) == {*others, "target", program("e"), program("f")}
 
 
 def test_nothing_is_deleted_through_a_link(tmp_path):
-    filled(tmp_path / "of the user")
+    fill(tmp_path / "of the user")
     (tmp_path / "vijax").symlink_to(tmp_path / "of the user")
     cache_folder.trim(tmp_path / "vijax", 0)
     assert len(names(tmp_path / "of the user")) == 3
 
 
 @pytest.fixture
-def untold():
-    """JAX as a program has it that names no folder."""
+def no_cache_folder():
+    """JAX without a cache folder, as in a program that sets none."""
     before = jax.config.values["jax_compilation_cache_dir"]
     jax.config.update("jax_compilation_cache_dir", None)
     yield
     jax.config.update("jax_compilation_cache_dir", before)
 
 
-def belongs_to_nobody(path):
-    """Give a file to another user, where this process has the right to do so."""
+def change_user(path):
+    """Give a file to another user; skip the test if this process must not."""
     try:
         os.chown(path, 65534, -1, follow_symlinks=False)
     except PermissionError:
         pytest.skip("only root can give files away")
 
 
-def spoiled_file(folder):
+def unsafe_file(folder):
     folder.write_text("")
 
 
-def spoiled_mode(folder):
+def unsafe_mode(folder):
     folder.mkdir()
     folder.chmod(0o777)
 
 
-def spoiled_owner(folder):
+def unsafe_user(folder):
     folder.mkdir()
-    belongs_to_nobody(folder)
+    change_user(folder)
 
 
-def spoiled_link(folder):
+def unsafe_link(folder):
     (folder.parent / "target").mkdir()
     folder.symlink_to(folder.parent / "target")
-    belongs_to_nobody(folder)
+    change_user(folder)
 
 
-SPOILED = [spoiled_file, spoiled_mode, spoiled_owner, spoiled_link]
+UNSAFE_FOLDERS = [unsafe_file, unsafe_mode, unsafe_user, unsafe_link]
 
 
-@pytest.mark.parametrize("spoil", SPOILED)
-def test_a_folder_that_cannot_be_trusted_is_not_used(tmp_path, monkeypatch, untold, spoil):
-    spoil(tmp_path / "vijax")
+@pytest.mark.parametrize("make_unsafe", UNSAFE_FOLDERS)
+def test_an_unsafe_folder_is_not_used(tmp_path, monkeypatch, no_cache_folder, make_unsafe):
+    make_unsafe(tmp_path / "vijax")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     cache_folder.keep_programs.__wrapped__()
     assert jax.config.values["jax_compilation_cache_dir"] is None
 
 
-def spoiled_pipe(path):
+def unsafe_pipe(path):
     os.mkfifo(path)
 
 
-def spoiled_program_link(path):
+def unsafe_program_link(path):
     path.symlink_to(path.parent / "elsewhere")
 
 
-def spoiled_program_owner(path):
+def unsafe_program_user(path):
     path.write_bytes(b"")
-    belongs_to_nobody(path)
+    change_user(path)
 
 
-def spoiled_program_mode(path):
+def unsafe_program_mode(path):
     path.parent.chmod(0o755)
     path.write_bytes(b"")
     path.chmod(0o666)
 
 
-SPOILED_PROGRAMS = [spoiled_pipe, spoiled_program_link, spoiled_program_owner, spoiled_program_mode]
+UNSAFE_PROGRAMS = [unsafe_pipe, unsafe_program_link, unsafe_program_user, unsafe_program_mode]
 
 
-@pytest.mark.parametrize("spoil", SPOILED_PROGRAMS)
-def test_a_folder_with_a_program_that_cannot_be_trusted_is_not_used(tmp_path, monkeypatch, untold, caplog, spoil):
-    """JAX reads whatever file there is."""
+@pytest.mark.parametrize("make_unsafe", UNSAFE_PROGRAMS)
+def test_a_folder_with_an_unsafe_program_is_not_used(tmp_path, monkeypatch, no_cache_folder, caplog, make_unsafe):
+    """JAX reads every file in its folder."""
     folder = tmp_path / "vijax"
     folder.mkdir(mode=0o700)
-    spoil(folder / program("a"))
+    make_unsafe(folder / program("a"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     cache_folder.keep_programs.__wrapped__()
     assert jax.config.values["jax_compilation_cache_dir"] is None
     assert f"got {program('a')}" in caplog.text
 
 
-@pytest.mark.parametrize("spoil", SPOILED_PROGRAMS)
-def test_a_file_that_cannot_be_trusted_is_not_read(tmp_path, spoil):
+@pytest.mark.parametrize("make_unsafe", UNSAFE_PROGRAMS)
+def test_an_unsafe_file_is_not_read(tmp_path, make_unsafe):
     (tmp_path / "elsewhere").write_bytes(b"")
-    spoil(tmp_path / program("a"))
+    make_unsafe(tmp_path / program("a"))
     assert cache_folder.read(tmp_path / program("a")) is None
 
 
-def test_a_file_of_a_closed_folder_is_read_whatever_its_mode(tmp_path):
-    """JAX makes files by the user's mask, which may let the group write."""
+def test_a_file_of_any_mode_is_read_from_a_private_folder(tmp_path):
+    """JAX creates files with the user's mask, which may let the group write."""
     folder = tmp_path / "vijax"
     folder.mkdir(mode=0o700)
     (folder / program("a")).write_bytes(b"content")
@@ -219,22 +221,22 @@ def test_a_file_of_a_closed_folder_is_read_whatever_its_mode(tmp_path):
     assert cache_folder.read(folder / program("a")) == b"content"
 
 
-def test_a_folder_given_to_jax_that_others_can_write_is_neither_read_nor_written(tmp_path, untold, caplog):
+def test_a_jax_folder_that_others_can_write_is_neither_read_nor_written(tmp_path, no_cache_folder, caplog):
     tmp_path.chmod(0o777)
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    assert cache_folder.kept() is None
-    assert cache_folder.kept() is None
+    assert cache_folder.program_folder() is None
+    assert cache_folder.program_folder() is None
     assert caplog.text.count("nobody else can write") == 1
 
 
-def test_a_folder_given_to_jax_that_is_missing_is_made_for_this_user_alone(tmp_path, untold):
+def test_a_missing_jax_folder_is_made_for_this_user_alone(tmp_path, no_cache_folder):
     folder = tmp_path / "above" / "programs"
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    assert cache_folder.kept() == folder
+    assert cache_folder.program_folder() == folder
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
 
 
-def test_a_user_without_a_home_keeps_nothing(monkeypatch, untold):
+def test_no_programs_are_stored_without_a_home_directory(monkeypatch, no_cache_folder):
     def homeless():
         raise RuntimeError("Could not determine home directory.")
 
@@ -244,17 +246,17 @@ def test_a_user_without_a_home_keeps_nothing(monkeypatch, untold):
     assert jax.config.values["jax_compilation_cache_dir"] is None
 
 
-def test_the_folder_is_that_of_compiled_programs(tmp_path):
+def test_traced_programs_are_stored_with_compiled_programs(tmp_path):
     before = {name: jax.config.values[name] for name in ("jax_compilation_cache_dir", "jax_enable_compilation_cache")}
     try:
-        for asked, kept, expected in ((str(tmp_path), True, tmp_path), (str(tmp_path), False, None)):
-            jax.config.update("jax_compilation_cache_dir", asked)
-            jax.config.update("jax_enable_compilation_cache", kept)
-            assert cache_folder.kept() == expected
+        for setting, enabled, expected in ((str(tmp_path), True, tmp_path), (str(tmp_path), False, None)):
+            jax.config.update("jax_compilation_cache_dir", setting)
+            jax.config.update("jax_enable_compilation_cache", enabled)
+            assert cache_folder.program_folder() == expected
         jax.config.update("jax_enable_compilation_cache", True)
-        for asked in (None, "gs://bucket/compiled"):
-            jax.config.update("jax_compilation_cache_dir", asked)
-            assert cache_folder.kept() is None
+        for setting in (None, "gs://bucket/compiled"):
+            jax.config.update("jax_compilation_cache_dir", setting)
+            assert cache_folder.program_folder() is None
     finally:
         for name, value in before.items():
             jax.config.update(name, value)

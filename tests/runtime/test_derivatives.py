@@ -1,4 +1,4 @@
-"""Derivatives at numbers are a program of all slopes; traced, those of JAX: the same numbers both ways."""
+"""Derivatives at numbers come from one program of all slopes, traced derivatives from JAX; both are equal."""
 
 from typing import NamedTuple
 
@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from jax import lax, monitoring
 
-from vijax.runtime.derivatives import differentiable, differentiable_rows
+from vijax.runtime.numerics.derivatives import differentiable, differentiable_rows
 
 
 class Result(NamedTuple):
-    """Numbers, and what has no derivative."""
+    """Numbers, and values without a derivative."""
 
     product: jax.Array
     powers: jax.Array
@@ -23,57 +23,57 @@ class Result(NamedTuple):
 traced: list[bool] = []
 
 
-def first(moved, about, *, kind):
-    """A number that moves, but is to be taken for one that does not."""
+def root(moved, about, *, kind):
+    """Return a number that depends on the inputs and is treated as a constant."""
     return moved["x"].sum()
 
 
-def of_what_was_found(moved, about, found, *, kind):
-    """Products and powers of a dictionary's numbers about some centre."""
+def products_and_powers(moved, about, root_value, *, kind):
+    """Return products and powers of a dictionary's numbers about a centre."""
     x, y = moved["x"], moved["y"]
     traced.append(isinstance(x, jax.core.Tracer))
-    product = jnp.sum(x * about) * (y if kind == "plain" else jnp.exp(y)) + found
+    product = jnp.sum(x * about) * (y if kind == "plain" else jnp.exp(y)) + root_value
     return Result(product, x**3, jnp.sum(x > 0, dtype=jnp.int32), y > 0)
 
 
-shape = differentiable(of_what_was_found, first, lambda about: np.zeros((), about.dtype))
+shape = differentiable(products_and_powers, root, lambda about: np.zeros((), about.dtype))
 
 
 ABOUT = jnp.array([1.0, -2.0, 0.5])
-GIVEN = {"x": jnp.array([0.3, 0.2, -0.7]), "y": jnp.array(1.3)}
+INPUTS = {"x": jnp.array([0.3, 0.2, -0.7]), "y": jnp.array(1.3)}
 
 
 def product(moved, kind="plain"):
     return shape(moved, ABOUT, kind=kind).product
 
 
-def test_slopes_are_those_by_hand_and_of_a_traced_program():
-    np.testing.assert_allclose(product(GIVEN), np.sum(GIVEN["x"] * ABOUT) * 1.3 + np.sum(GIVEN["x"]), rtol=1e-15)
+def test_slopes_equal_slopes_by_hand_and_of_a_traced_program():
+    np.testing.assert_allclose(product(INPUTS), np.sum(INPUTS["x"] * ABOUT) * 1.3 + np.sum(INPUTS["x"]), rtol=1e-15)
     for kind, grown, slope in (("plain", 1.3, 1.0), ("grown", np.exp(1.3), np.exp(1.3))):
-        found = jax.grad(product)(GIVEN, kind)
-        np.testing.assert_allclose(found["x"], ABOUT * grown, rtol=1e-15)
-        np.testing.assert_allclose(found["y"], np.sum(GIVEN["x"] * ABOUT) * slope, rtol=1e-14)
-        inside = jax.jit(jax.grad(product), static_argnums=1)(GIVEN, kind)
-        for name in GIVEN:
-            np.testing.assert_allclose(found[name], inside[name], rtol=1e-14)
+        slopes = jax.grad(product)(INPUTS, kind)
+        np.testing.assert_allclose(slopes["x"], ABOUT * grown, rtol=1e-15)
+        np.testing.assert_allclose(slopes["y"], np.sum(INPUTS["x"] * ABOUT) * slope, rtol=1e-14)
+        inside = jax.jit(jax.grad(product), static_argnums=1)(INPUTS, kind)
+        for name in INPUTS:
+            np.testing.assert_allclose(slopes[name], inside[name], rtol=1e-14)
 
 
 def test_forward_reverse_second_and_batched_derivatives_agree():
     np.testing.assert_allclose(
-        jax.jacfwd(lambda x: shape(GIVEN | {"x": x}, ABOUT, kind="plain").powers)(GIVEN["x"]),
-        jax.jacrev(lambda x: shape(GIVEN | {"x": x}, ABOUT, kind="plain").powers)(GIVEN["x"]),
+        jax.jacfwd(lambda x: shape(INPUTS | {"x": x}, ABOUT, kind="plain").powers)(INPUTS["x"]),
+        jax.jacrev(lambda x: shape(INPUTS | {"x": x}, ABOUT, kind="plain").powers)(INPUTS["x"]),
         rtol=1e-15,
     )
-    twice = jax.hessian(lambda x: shape(GIVEN | {"x": x}, ABOUT, kind="plain").powers.sum())(GIVEN["x"])
-    np.testing.assert_allclose(twice, np.diag(6 * np.asarray(GIVEN["x"])), atol=1e-15)
-    many = jax.vmap(jax.grad(lambda y: product(GIVEN | {"y": y}, "grown")))(jnp.array([0.1, 0.2]))
-    np.testing.assert_allclose(many, np.sum(GIVEN["x"] * ABOUT) * np.exp([0.1, 0.2]), rtol=1e-14)
+    twice = jax.hessian(lambda x: shape(INPUTS | {"x": x}, ABOUT, kind="plain").powers.sum())(INPUTS["x"])
+    np.testing.assert_allclose(twice, np.diag(6 * np.asarray(INPUTS["x"])), atol=1e-15)
+    many = jax.vmap(jax.grad(lambda y: product(INPUTS | {"y": y}, "grown")))(jnp.array([0.1, 0.2]))
+    np.testing.assert_allclose(many, np.sum(INPUTS["x"] * ABOUT) * np.exp([0.1, 0.2]), rtol=1e-14)
 
 
-def test_slopes_by_variables_of_every_shape_are_told_apart():
+def test_slopes_are_separate_for_variables_of_all_shapes():
     weights = {"a": np.array([1.0, 2.0, 3.0]), "b": np.array(4.0), "c": np.array([[5.0, 6.0], [7.0, 8.0]])}
 
-    def load(moved, about, found, *, kind):
+    def load(moved, about, root_value, *, kind):
         return about * sum((weights[name] * moved[name]).sum() for name in weights)
 
     beam = differentiable(load, lambda moved, about, *, kind: about, np.asarray)
@@ -83,16 +83,16 @@ def test_slopes_by_variables_of_every_shape_are_told_apart():
 
 
 def test_results_without_derivatives_have_none():
-    result, moved = jax.jvp(lambda x: shape(GIVEN | {"x": x}, ABOUT, kind="plain"), (GIVEN["x"],), (jnp.ones(3),))
+    result, moved = jax.jvp(lambda x: shape(INPUTS | {"x": x}, ABOUT, kind="plain"), (INPUTS["x"],), (jnp.ones(3),))
     assert int(result.rank) == 2
     assert bool(result.positive)
     assert moved.rank.dtype == moved.positive.dtype == jax.dtypes.float0
-    np.testing.assert_allclose(moved.powers, 3 * GIVEN["x"] ** 2, rtol=1e-15)
+    np.testing.assert_allclose(moved.powers, 3 * INPUTS["x"] ** 2, rtol=1e-15)
 
 
-def test_at_numbers_a_program_of_its_own_is_compiled():
-    def height(moved, about, found, *, kind):
-        return jnp.cos(moved) * about + found
+def test_derivatives_at_numbers_compile_a_separate_program():
+    def height(moved, about, root_value, *, kind):
+        return jnp.cos(moved) * about + root_value
 
     def double(moved, about, *, kind):
         return 2 * moved
@@ -118,20 +118,20 @@ def test_at_numbers_a_program_of_its_own_is_compiled():
     "derivative", [jax.grad, *(pytest.param(of, marks=pytest.mark.long) for of in (jax.value_and_grad, jax.jacfwd))]
 )
 def test_other_numbers_and_other_derivatives_trace_nothing_anew(derivative):
-    jax.grad(product)(GIVEN)
+    jax.grad(product)(INPUTS)
     before = len(traced)
     for y in (0.1, 0.2):
-        derivative(lambda y: product(GIVEN | {"y": y}))(jnp.array(y))
+        derivative(lambda y: product(INPUTS | {"y": y}))(jnp.array(y))
     assert len(traced) == before
 
 
 rows_traced: list[int] = []
 
 
-def fall(weights, x, y, *, room):
-    """Products of a row's numbers at several times, its sign, and what no row moves."""
+def fall(weights, x, y, *, capacity):
+    """Return products of a row's numbers at several times, its sign, and a value that does not depend on it."""
     rows_traced.append(x.shape[0])
-    times = jnp.asarray(weights) * jnp.arange(1.0, room + 1)
+    times = jnp.asarray(weights) * jnp.arange(1.0, capacity + 1)
     return x[:, None] * jnp.sin(y)[:, None] * times, (x > 0).astype(jnp.int32), 0 * x + 1
 
 
@@ -141,25 +141,25 @@ TIMES = 2.0 * np.arange(1, 4)
 
 
 def fallen(x, y):
-    return FALLING(2.0, x, y, room=3)[0]
+    return FALLING(2.0, x, y, capacity=3)[0]
 
 
-def test_slopes_of_rows_are_those_by_hand_both_ways():
+def test_slopes_of_rows_equal_slopes_by_hand_in_both_modes():
     by_x, by_y = np.sin(Y)[:, None] * TIMES, (X * np.cos(Y))[:, None] * TIMES
     for derivative in (jax.jacfwd, jax.jacrev):
-        # A row hangs on its own numbers alone.
-        for slopes, known in zip(derivative(fallen, argnums=(0, 1))(X, Y), (by_x, by_y), strict=True):
-            np.testing.assert_allclose(slopes, known[..., None] * np.eye(3)[:, None], rtol=1e-15)
-    one, other = jax.grad(lambda x, y: fallen(x, y)[1, 2], argnums=(0, 1))(X, Y)
-    np.testing.assert_allclose(one, [0, by_x[1, 2], 0], rtol=1e-15)
-    np.testing.assert_allclose(other, [0, by_y[1, 2], 0], rtol=1e-15)
+        # A row of results depends on its row of inputs alone.
+        for slopes, expected in zip(derivative(fallen, argnums=(0, 1))(X, Y), (by_x, by_y), strict=True):
+            np.testing.assert_allclose(slopes, expected[..., None] * np.eye(3)[:, None], rtol=1e-15)
+    slope_x, slope_y = jax.grad(lambda x, y: fallen(x, y)[1, 2], argnums=(0, 1))(X, Y)
+    np.testing.assert_allclose(slope_x, [0, by_x[1, 2], 0], rtol=1e-15)
+    np.testing.assert_allclose(slope_y, [0, by_y[1, 2], 0], rtol=1e-15)
 
 
-def test_slopes_of_rows_do_not_hang_on_how_they_are_asked_for():
-    known = jax.grad(lambda y: fallen(X, y).sum())(Y)
-    np.testing.assert_allclose(jax.jit(jax.grad(lambda y: fallen(X, y).sum()))(Y), known, rtol=1e-14)
+def test_slopes_of_rows_are_equal_by_all_transformations():
+    expected = jax.grad(lambda y: fallen(X, y).sum())(Y)
+    np.testing.assert_allclose(jax.jit(jax.grad(lambda y: fallen(X, y).sum()))(Y), expected, rtol=1e-14)
     several = jax.vmap(jax.grad(lambda y: fallen(X, y).sum()))(np.stack([Y, 2 * Y]))
-    np.testing.assert_allclose(several[0], known, rtol=1e-14)
+    np.testing.assert_allclose(several[0], expected, rtol=1e-14)
     for twice in (jax.hessian, lambda of: jax.jacrev(jax.jacrev(of)), lambda of: jax.jacfwd(jax.jacfwd(of))):
         curved = twice(lambda y: fallen(X, y).sum())(Y)
         np.testing.assert_allclose(curved, np.diag(-X * np.sin(Y) * TIMES.sum()), atol=1e-14)
@@ -178,24 +178,24 @@ def test_rows_and_derivatives_of_any_number_share_a_program_until_they_are_many(
 
 @pytest.mark.long
 def test_batches_of_any_length_share_a_program():
-    """Those of a few; a batch that JAX makes outside of a program is padded."""
+    """Batches of a few rows share it; a batch that JAX makes outside of a program is padded."""
 
     def of_rows(y):
-        return FALLING(2.0, X[:1], y[None], room=3)[0].sum()
+        return FALLING(2.0, X[:1], y[None], capacity=3)[0].sum()
 
-    def of_one(y):
-        return product(GIVEN | {"y": y})
+    def of_number(y):
+        return product(INPUTS | {"y": y})
 
-    for of, known, slope, count in (
+    for of, value, slope, count in (
         (of_rows, lambda y: X[0] * np.sin(y) * TIMES.sum(), lambda y: X[0] * np.cos(y) * TIMES.sum(), rows_traced),
         (
-            of_one,
-            lambda y: np.sum(GIVEN["x"] * ABOUT) * y + np.sum(GIVEN["x"]),
-            lambda y: np.sum(GIVEN["x"] * ABOUT) + 0 * y,
+            of_number,
+            lambda y: np.sum(INPUTS["x"] * ABOUT) * y + np.sum(INPUTS["x"]),
+            lambda y: np.sum(INPUTS["x"] * ABOUT) + 0 * y,
             traced,
         ),
     ):
-        for derivative, expected in ((lambda f: f, known), (jax.grad, slope), (jax.jacfwd, slope)):
+        for derivative, expected in ((lambda f: f, value), (jax.grad, slope), (jax.jacfwd, slope)):
             y = jnp.linspace(1.0, 1.3, 8)
             jax.vmap(derivative(of))(y[:2])
             before = len(count)
@@ -207,11 +207,11 @@ def test_batches_of_any_length_share_a_program():
         outside = jax.grad(lambda y, of=of: jax.vmap(of)(y).sum())(y)
         np.testing.assert_allclose(outside, slope(np.asarray(y)), rtol=1e-14)
         nested = jax.vmap(jax.vmap(of))(jnp.stack([y, 2 * y]))
-        np.testing.assert_allclose(nested[1], known(2 * np.asarray(y)), rtol=1e-14)
+        np.testing.assert_allclose(nested[1], value(2 * np.asarray(y)), rtol=1e-14)
 
 
-def test_what_no_row_moves_and_what_counts_has_no_slope():
-    (moved, count, still), (slope, none, zero) = jax.jvp(lambda x: FALLING(2.0, x, Y, room=3), (X,), (np.ones(3),))
+def test_constant_and_integer_results_have_no_slope():
+    (moved, count, still), (slope, none, zero) = jax.jvp(lambda x: FALLING(2.0, x, Y, capacity=3), (X,), (np.ones(3),))
     np.testing.assert_array_equal(count, [1, 0, 1])
     assert none.dtype == jax.dtypes.float0
     np.testing.assert_array_equal(still, 1.0)
@@ -220,27 +220,27 @@ def test_what_no_row_moves_and_what_counts_has_no_slope():
     np.testing.assert_allclose(moved, X[:, None] * slope, rtol=1e-15)
 
 
-def test_derivatives_of_rows_in_a_traced_program_take_one_forward_pass():
-    """In reverse, a run needs a loop forward and a loop backward."""
+def test_derivatives_of_rows_in_a_traced_program_take_a_single_forward_pass():
+    """In reverse mode, a simulation needs a loop forward and a loop backward."""
 
-    def swing(weights, x, y, *, room):
+    def swing(weights, x, y, *, capacity):
         def step(x, _):
             x = jnp.sin(x) * y
             return x, x
 
-        return lax.scan(step, x, length=room)[1].swapaxes(0, 1) * weights
+        return lax.scan(step, x, length=capacity)[1].swapaxes(0, 1) * weights
 
     swinging = differentiable_rows(swing, (1, 4))
 
     def total(x):
-        return swinging(2.0, x[None, 0], x[None, 1], room=3).sum()
+        return swinging(2.0, x[None, 0], x[None, 1], capacity=3).sum()
 
     def plain(x):
-        a, found = x[0], 0.0
+        a, result = x[0], 0.0
         for _ in range(3):
             a = jnp.sin(a) * x[1]
-            found += 2 * a
-        return found
+            result += 2 * a
+        return result
 
     x = np.array([0.3, 1.2])
     for derivative in (jax.grad, jax.jacfwd, jax.hessian, lambda f: jax.jacrev(jax.jacrev(f))):

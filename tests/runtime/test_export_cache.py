@@ -1,4 +1,4 @@
-"""A program is traced once: kept with what it depends on, read back bit for bit, traced anew where that fails."""
+"""A program is traced once, stored with its dependencies, read back bit for bit, and traced anew if that fails."""
 
 import ast
 import hashlib
@@ -21,9 +21,9 @@ import pytest
 from jax import monitoring
 
 import vijax
-from vijax.batch.cell import Plan
 from vijax.model.records import State
-from vijax.runtime import cache_folder, export_cache, xla
+from vijax.runtime.compilation import cache_folder, export_cache, xla
+from vijax.simulation.cell.cell import Plan
 
 PACKAGE = Path(vijax.__file__).parent
 X = jnp.linspace(0.1, 2.0, 7)
@@ -35,31 +35,31 @@ class Work:
     def __init__(self):
         self.traced = 0
 
-    def __call__(self, given):
+    def __call__(self, inputs):
         """A wave."""
         self.traced += 1
-        return jnp.sin(given["x"]) / given["y"]
+        return jnp.sin(inputs["x"]) / inputs["y"]
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     place = tmp_path / "compiled"
-    monkeypatch.setattr(cache_folder, "kept", lambda: place)
+    monkeypatch.setattr(cache_folder, "program_folder", lambda: place)
     return place
 
 
 def called(name="wave", x=X):
-    """The result of a fresh program, as a new process would make it, and how often that traced."""
+    """Return the result of a fresh program, as in a new process, and the number of its traces."""
     work = Work()
     program = export_cache.TracedProgram(work, name)
-    given = {"x": x, "y": jnp.asarray(3.0, x.dtype)}
-    first = np.asarray(program(given))
-    np.testing.assert_array_equal(program(given), first)
+    inputs = {"x": x, "y": jnp.asarray(3.0, x.dtype)}
+    first = np.asarray(program(inputs))
+    np.testing.assert_array_equal(program(inputs), first)
     np.testing.assert_allclose(first, np.sin(np.asarray(x)) / 3.0, rtol=1e-6 if x.dtype == "float32" else 1e-15)
     return first, work.traced
 
 
-def test_what_a_worker_of_a_cluster_is_sent_names_the_same_program():
+def test_a_pickled_plan_names_the_same_program():
     plan = Plan(until="window", deep=True)
     assert str(pickle.loads(pickle.dumps(plan))) == str(plan) != str(Plan(deep=True))
     assert str(pickle.loads(pickle.dumps(Plan()))) == str(Plan())
@@ -74,7 +74,7 @@ def test_the_second_process_does_not_trace(folder):
 
 
 @pytest.mark.parametrize("changed", [{"name": "tide"}, {"x": X[:5]}, {"x": X.astype("float32")}])
-def test_another_program_or_shape_is_another_one(folder, changed):
+def test_another_name_or_shape_is_another_program(folder, changed):
     called()
     assert called(**changed)[1] == 1
     assert called(**changed)[1] == 0
@@ -82,13 +82,13 @@ def test_another_program_or_shape_is_another_one(folder, changed):
 
 
 class Theirs(eqx.Module):
-    """A record whose source the digest does not see: a method that a user wrote."""
+    """A record of a user; its source is not part of the digest."""
 
     y: jax.Array
 
 
-def test_programs_of_somebody_elses_records_are_traced_every_time(folder):
-    """What the record does may have changed since."""
+def test_programs_of_foreign_records_are_not_stored(folder):
+    """The methods of the record may have changed since."""
     for _ in range(2):
         work = Work()
         export_cache.TracedProgram(lambda x, theirs, work=work: work({"x": x, "y": theirs.y}), "wave")(X, Theirs(X))
@@ -98,32 +98,32 @@ def test_programs_of_somebody_elses_records_are_traced_every_time(folder):
     assert len(list(folder.iterdir())) == 1
 
 
-def test_a_program_without_kernels_is_another_one(folder, monkeypatch):
+def test_a_program_without_kernels_is_another_program(folder, monkeypatch):
     called()
     monkeypatch.setattr(xla, "KERNELS", not xla.KERNELS)
     assert called()[1] == 1
     assert len(list(folder.iterdir())) == 2
 
 
-def test_a_program_for_a_gpu_is_kept_by_the_name_of_its_platform(monkeypatch):
-    """JAX calls the device of an array a GPU, and exports for CUDA."""
+def test_a_program_for_a_gpu_is_stored_by_the_name_of_its_platform(monkeypatch):
+    """JAX names the platform of an array gpu, and the platform of an export cuda."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(export_cache.export, "default_export_platform", lambda: "cuda")
     assert export_cache._platform([np.zeros(3)]) == "cuda"
     assert export_cache._platform([X]) == "cpu"
 
 
-def test_a_program_made_for_another_platform_is_another_one(folder, monkeypatch):
-    """On the CPU of a machine with a GPU, too."""
+def test_a_program_for_another_platform_is_another_program(folder, monkeypatch):
+    """This holds on the CPU of a machine with a GPU, too."""
     called()
     monkeypatch.setattr(xla, "platform", lambda: "gpu")
     assert called()[1] == 1
     assert len(list(folder.iterdir())) == 2
 
 
-@pytest.mark.parametrize("kept", [True, False])
-def test_threads_that_call_at_once_compile_it_once(tmp_path, monkeypatch, kept):
-    monkeypatch.setattr(cache_folder, "kept", lambda: tmp_path if kept else None)
+@pytest.mark.parametrize("stored", [True, False])
+def test_threads_that_call_a_program_at_once_compile_it_once(tmp_path, monkeypatch, stored):
+    monkeypatch.setattr(cache_folder, "program_folder", lambda: tmp_path if stored else None)
     program = export_cache.TracedProgram(
         lambda x: jax.lax.fori_loop(0, 3, lambda _, y: jnp.sin(y) + jnp.cos(y), x), "loop"
     )
@@ -140,12 +140,12 @@ def test_threads_that_call_at_once_compile_it_once(tmp_path, monkeypatch, kept):
     monitoring.register_event_duration_secs_listener(count)
     try:
         with ThreadPoolExecutor(4) as pool:
-            found = list(pool.map(call, range(4)))
+            results = list(pool.map(call, range(4)))
     finally:
         monitoring.unregister_event_duration_listener(count)
     assert len(compiled) == 1
-    for one in found:
-        np.testing.assert_array_equal(one, found[0])
+    for result in results:
+        np.testing.assert_array_equal(result, results[0])
 
 
 def test_a_change_in_any_folder_changes_the_digest(tmp_path):
@@ -153,7 +153,7 @@ def test_a_change_in_any_folder_changes_the_digest(tmp_path):
     shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
     digest = export_cache.source_digest.__wrapped__
     digests = {digest(), digest(package)}
-    assert len(digests) == 1  # of the same sources elsewhere
+    assert len(digests) == 1  # the same sources in another folder
     folders = [package, *sorted(path.parent for path in package.glob("*/__init__.py"))]
     assert len(folders) > 5
     for folder in folders:
@@ -163,26 +163,28 @@ def test_a_change_in_any_folder_changes_the_digest(tmp_path):
     assert len(digests) == len(folders) + 1
 
 
-def test_all_that_a_trace_goes_through_is_in_the_digest(monkeypatch):
-    asked = []
-    monkeypatch.setattr(export_cache, "version", lambda name: asked.append(name) or "1")
+def test_all_packages_that_a_trace_uses_are_in_the_digest(monkeypatch):
+    versioned = []
+    monkeypatch.setattr(export_cache, "version", lambda name: versioned.append(name) or "1")
     export_cache.source_digest.__wrapped__()
-    rooms = {path for folder in ("batch", "engine") for path in (PACKAGE / folder).glob("*.py")}
-    rooms |= {path for path in PACKAGE.glob("*/*.py") if "jitted" in path.read_text()}
-    nodes = [node for path in rooms for node in ast.walk(ast.parse(path.read_text()))]
+    sources = {path for folder in ("simulation", "impact") for path in (PACKAGE / folder).rglob("*.py")}
+    sources |= {path for path in PACKAGE.rglob("*.py") if "jitted" in path.read_text()}
+    nodes = [node for path in sources for node in ast.walk(ast.parse(path.read_text()))]
     tops = {alias.name.split(".")[0] for node in nodes if isinstance(node, ast.Import) for alias in node.names}
     tops |= {node.module.split(".")[0] for node in nodes if isinstance(node, ast.ImportFrom)}
-    # What the engines, the batch and rooms with programs of their own import, and what that stands on.
-    waiting, found = [top for top in tops - sys.stdlib_module_names - {"vijax"}], set()
+    # Packages that modules with programs import, and the requirements of these packages.
+    waiting, required = [top for top in tops - sys.stdlib_module_names - {"vijax"}], set()
     assert {"jax", "diffrax"} <= set(waiting)
     while waiting:
         name = waiting.pop()
-        found.add(name)
+        required.add(name)
         needed = [
             re.split(r"[^\w.-]", line)[0].replace("-", "_") for line in requires(name) or [] if "extra ==" not in line
         ]
-        waiting += [one for one in needed if one not in found]
-    assert found - {"scipy", "typing_extensions", "wadler_lindig"} == set(asked)  # special functions, types and print
+        waiting += [package for package in needed if package not in required]
+    assert required - {"scipy", "typing_extensions", "wadler_lindig"} == set(
+        versioned
+    )  # special functions, types and print
 
 
 def test_other_sources_are_other_programs(folder, monkeypatch):
@@ -195,11 +197,11 @@ def test_other_sources_are_other_programs(folder, monkeypatch):
 def test_a_damaged_file_is_written_anew(folder, damage):
     called()
     (path,) = folder.iterdir()
-    whole = path.read_bytes()
-    path.write_bytes(damage(whole))
+    content = path.read_bytes()
+    path.write_bytes(damage(content))
     assert called()[1] == 1
     assert called()[1] == 0
-    assert [one.name for one in folder.iterdir()] == [path.name]
+    assert [file.name for file in folder.iterdir()] == [path.name]
 
 
 class Payload:
@@ -213,7 +215,7 @@ RAN: list[int] = []
 
 
 def sign(path, body):
-    """The digest that a reader expects before the content of a file."""
+    """Return the digest that a reader expects before the content of a file."""
     return export_cache._signed(path, body)
 
 
@@ -222,9 +224,9 @@ def pickled(path, _):
     return [hashlib.sha256(content).digest() + content, sign(path, content) + content]
 
 
-def malformed(path, whole):
-    """Files with the right digest whose program or structure cannot be rebuilt."""
-    body, size = whole[32:], export_cache._LENGTH
+def malformed(path, content):
+    """Return files with the right digest, and a program or structure that cannot be rebuilt."""
+    body, size = content[32:], export_cache._LENGTH
     program = body[size + int.from_bytes(body[:size], "little") :]
     structures = (
         b'["os:system"]',
@@ -235,15 +237,15 @@ def malformed(path, whole):
         b"\xff",
     )
     bodies = [len(text).to_bytes(size, "little") + text + program for text in structures]
-    return [sign(path, one) + one for one in (*bodies, body[:99], bytes(99), b"")]
+    return [sign(path, part) + part for part in (*bodies, body[:99], bytes(99), b"")]
 
 
 @pytest.mark.parametrize("contents", [pickled, malformed])
 def test_a_file_that_is_no_program_is_written_anew_and_runs_nothing(folder, contents):
     called()
     (path,) = folder.iterdir()
-    whole = path.read_bytes()
-    for content in contents(path, whole):
+    original = path.read_bytes()
+    for content in contents(path, original):
         path.write_bytes(content)
         assert called()[1] == 1
         assert called()[1] == 0
@@ -256,9 +258,9 @@ def test_the_file_of_another_program_is_written_anew(folder):
     export_cache.TracedProgram(lambda x: (x, x + 1), "pair")(X)
     (pair,) = set(folder.iterdir()) - {wave}
     pair.write_bytes(wave.read_bytes())
-    kept, after = export_cache.TracedProgram(lambda x: (x, x + 1), "pair")(X)
+    same, after = export_cache.TracedProgram(lambda x: (x, x + 1), "pair")(X)
     np.testing.assert_array_equal(after, X + 1)
-    np.testing.assert_array_equal(kept, X)
+    np.testing.assert_array_equal(same, X)
 
 
 def test_a_pipe_in_place_of_a_file_does_not_block(folder):
@@ -276,10 +278,10 @@ def test_a_file_is_for_this_user_alone(folder):
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
 
-def test_where_nothing_can_be_kept_it_is_traced_every_time(tmp_path, monkeypatch):
-    taken = tmp_path / "file"
-    taken.touch()
-    for place in (taken, None):
-        monkeypatch.setattr(cache_folder, "kept", lambda place=place: place)
+def test_without_a_folder_a_program_is_traced_in_all_processes(tmp_path, monkeypatch):
+    file = tmp_path / "file"
+    file.touch()
+    for place in (file, None):
+        monkeypatch.setattr(cache_folder, "program_folder", lambda place=place: place)
         assert called()[1] == called()[1] == 1
-    assert taken.read_bytes() == b""
+    assert file.read_bytes() == b""

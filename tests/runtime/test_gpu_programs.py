@@ -1,4 +1,4 @@
-"""Programs for a GPU, without one: all that public functions compile is lowered for CUDA, as an accelerator has it."""
+"""Programs for a GPU, tested without a GPU: all programs that public functions compile are lowered for CUDA."""
 
 import jax
 import numpy as np
@@ -7,27 +7,27 @@ from jax import export
 
 import vijax
 from tests.helpers import cases, described_gpu
-from tests.runtime.test_programs import CALLS, known  # noqa: F401  a fixture
-from vijax.batch import lanes, stragglers
-from vijax.batch.cell import Plan
-from vijax.planes import tile_size
-from vijax.runtime import export_cache, xla
-from vijax.runtime.export_cache import TracedProgram
+from tests.runtime.test_programs import CALLS, attracting_orbit  # noqa: F401  a fixture
+from vijax.maps.execution import tile_size
+from vijax.runtime.compilation import export_cache, xla
+from vijax.runtime.compilation.export_cache import TracedProgram
+from vijax.simulation.cell.cell import Plan
+from vijax.simulation.scheduler import lane_scheduler, remaining_cells
 
-# What calls no program that is kept: it is a part of the caller's, or NumPy's.
+# Functions without a stored program: they are a part of the caller's program, or use NumPy.
 WITHOUT = (
     "impact_pair",
     "harvested_energy",
     "steady, vmap",
     "trajectory, grad",
-    "orbit_properties.labels",
-    "orbit_properties.power",
+    "orbit_properties.orbit_labels",
+    "orbit_properties.orbit_power",
     "curve",
 )
 PROGRAMS = [name for name in CALLS if name not in WITHOUT]
-# What CI lowers, the others taking minutes: a plane and an orbit.
+# Programs that CI lowers, of a map and of an orbit; the others take minutes.
 FEW = ("sweep", "steady")
-# Of the inclined ones half are those on which gravity holds the ball, which a GPU once never came back from.
+# In half of the inclined cells gravity prolongs the contacts; on a GPU, a program for them once did not end.
 PLANES = {
     "rigid": {"wall": "rigid"},
     "level": {"kappa": 40.0},
@@ -37,22 +37,22 @@ PLANES = {
 
 @pytest.fixture
 def called(monkeypatch):
-    """The traced programs that are called, with the shapes of their arguments, each once."""
-    found = {}
+    """The distinct traced programs that are called, with the shapes of their arguments."""
+    programs = {}
     call = TracedProgram.__call__
 
     def noted(self, *args, **kwargs):
         shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(np.shape(leaf), leaf.dtype), args)
-        found[self._name, str(shapes)] = self, shapes
+        programs[self._name, str(shapes)] = self, shapes
         return call(self, *args, **kwargs)
 
     monkeypatch.setattr(TracedProgram, "__call__", noted)
-    return found
+    return programs
 
 
 @pytest.mark.parametrize("name", cases(PROGRAMS, long=tuple(set(PROGRAMS) - set(FEW))))
-def test_every_program_is_lowered_for_a_gpu(name, known, called, on_gpu):  # noqa: F811
-    CALLS[name](0, known)
+def test_programs_are_lowered_for_a_gpu(name, attracting_orbit, called, on_gpu):  # noqa: F811
+    CALLS[name](0, attracting_orbit)
     on_gpu()
     assert called
     for program, shapes in called.values():
@@ -60,46 +60,48 @@ def test_every_program_is_lowered_for_a_gpu(name, known, called, on_gpu):  # noq
 
 
 def check_lowered(program, shapes):
-    """Look at what a program becomes for CUDA, and give it."""
+    """Lower a program for CUDA, check its text, and return the text."""
     leaves, tree = jax.tree.flatten(shapes)
 
     def flat(*leaves):
         return jax.tree.leaves(program._work(*jax.tree.unflatten(tree, leaves)))
 
     with described_gpu():
-        made = export.export(jax.jit(flat), platforms=["cuda"], disabled_checks=[export_cache.KERNEL])(*leaves)
-    text = made.mlir_module()
+        exported = export.export(jax.jit(flat), platforms=["cuda"], disabled_checks=[export_cache.KERNEL])(*leaves)
+    text = exported.mlir_module()
     assert "callback" not in text  # the host is never called
     assert "lapack" not in text
     assert "xla_cpu" not in text
-    assert any(value.dtype == np.float64 for value in made.out_avals)
-    assert not any(value.dtype == np.float32 for value in made.out_avals)
+    assert any(value.dtype == np.float64 for value in exported.out_avals)
+    assert not any(value.dtype == np.float32 for value in exported.out_avals)
     return text
 
 
 @pytest.mark.long
-def test_the_program_that_leaves_its_last_cells_is_lowered_for_a_gpu(known, called, on_gpu):  # noqa: F811
-    """Public functions call it there, and the program of a whole tile here: the same arguments go into both."""
-    CALLS["sweep"](0, known)
+def test_the_program_that_stops_at_few_remaining_cells_is_lowered_for_a_gpu(attracting_orbit, called, on_gpu):  # noqa: F811
+    """Public functions call it on a GPU, and the program of a whole tile on a CPU; both take the same arguments."""
+    CALLS["sweep"](0, attracting_orbit)
     on_gpu()
     (shapes,) = (shapes for (name, _), (_, shapes) in called.items() if "tile" in name)
-    text = check_lowered(stragglers._compiled_most(Plan(deep=True, work=True, energies=True), 256, 16), shapes)
+    text = check_lowered(
+        remaining_cells._compiled_until_few(Plan(deep=True, work=True, energies=True), 256, 16), shapes
+    )
     assert "__gpu$xla.gpu.triton" in text  # lanes stay in registers
 
 
 def test_a_gpu_has_larger_tiles_and_more_lanes(monkeypatch):
     monkeypatch.delenv("VIJAX_TILE", raising=False)
-    assert tile_size.largest() == lanes.TABLE == 32_768
-    assert [lanes.width_of(cells) for cells in (10, 64, 65, 4_096, 10**6)] == [16, 16, 64, 64, 64]
-    assert [lanes.table_rows(cells, 1) for cells in (10, 65, 32_768, 10**6)] == [64, 32_768, 32_768, 10**6]
-    assert [lanes.table_rows(cells, 64) for cells in (10, 65, 1_024)] == [64, 512, 1_024]
+    assert tile_size.max_cells() == lane_scheduler.TABLE_ROWS == 32_768
+    assert [lane_scheduler.width_of(cells) for cells in (10, 64, 65, 4_096, 10**6)] == [16, 16, 64, 64, 64]
+    assert [lane_scheduler.table_rows(cells, 1) for cells in (10, 65, 32_768, 10**6)] == [64, 32_768, 32_768, 10**6]
+    assert [lane_scheduler.table_rows(cells, 64) for cells in (10, 65, 1_024)] == [64, 512, 1_024]
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert tile_size.largest() == 4_194_304
-    assert lanes.table_rows(10, 1) == 10
-    assert [lanes.width_of(cells) for cells in (100, 10**4, 10**5, 10**7)] == [256, 8_192, 12_544, 131_072]
+    assert tile_size.max_cells() == 4_194_304
+    assert lane_scheduler.table_rows(10, 1) == 10
+    assert [lane_scheduler.width_of(cells) for cells in (100, 10**4, 10**5, 10**7)] == [256, 8_192, 12_544, 131_072]
 
 
-def test_a_gpu_is_given_what_it_is_asked_for_in_xla_flags(monkeypatch):
+def test_gpu_options_in_xla_flags_take_precedence(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.delenv("XLA_FLAGS", raising=False)
     name = "xla_gpu_enable_command_buffer"
@@ -111,17 +113,17 @@ def test_a_gpu_is_given_what_it_is_asked_for_in_xla_flags(monkeypatch):
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", PLANES)
-def test_a_plane_as_a_gpu_has_it_comes_out_the_same(name, on_gpu, monkeypatch):
-    """Run here: other loops, lookups and services of what the quick step declines; the cores fly the last cells."""
-    asked = {"d": np.linspace(0.12, 0.3, 8), "r": np.linspace(0.4, 0.7, 6)} | PLANES[name]
-    plain = vijax.sweep(**asked)
+def test_a_map_by_the_programs_of_a_gpu_is_the_same(name, on_gpu, monkeypatch):
+    """Run on a CPU: the loops, lookups and fallbacks of a GPU; the cores of the CPU simulate the last cells."""
+    arguments = {"d": np.linspace(0.12, 0.3, 8), "r": np.linspace(0.4, 0.7, 6)} | PLANES[name]
+    plain = vijax.sweep(**arguments)
     on_gpu()
     monkeypatch.setattr(export_cache.export, "default_export_platform", lambda: "cpu")
-    monkeypatch.setattr(stragglers, "_EACH", 4)
-    found = vijax.sweep(**asked)
-    stragglers._compiled.cache_clear()
-    stragglers._compiled_most.cache_clear()
+    monkeypatch.setattr(remaining_cells, "_CELLS_PER_CORE", 4)
+    lowered = vijax.sweep(**arguments)
+    remaining_cells._compiled.cache_clear()
+    remaining_cells._compiled_until_few.cache_clear()
     settled = plain.period.values > 0
     assert settled.mean() > 0.3
-    np.testing.assert_array_equal(found.period.values[settled], plain.period.values[settled])
-    np.testing.assert_allclose(found.P.values[settled], plain.P.values[settled], rtol=1e-9)
+    np.testing.assert_array_equal(lowered.period.values[settled], plain.period.values[settled])
+    np.testing.assert_allclose(lowered.P.values[settled], plain.P.values[settled], rtol=1e-9)

@@ -1,4 +1,4 @@
-"""Small systems are solved, pivots zero or not, with derivatives of every order."""
+"""Small systems are solved, also with zero pivots, with derivatives of every order."""
 
 from functools import partial
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vijax.runtime import linear_solve
+from vijax.runtime.numerics import linear_solve
 
 
 @pytest.mark.parametrize("size", [1, 3, 7])
@@ -17,22 +17,22 @@ def test_systems_are_solved(size):
     if size > 1:
         matrix[:32, 0, 0] = 0.0  # no pivot where elimination begins
     right = np.einsum("bij,bj->bi", matrix, x)
-    found = jax.jit(jax.vmap(linear_solve.solve))(matrix, right)
-    backward = np.abs(np.einsum("bij,bj->bi", matrix, found) - right).max(axis=1)
-    scale = np.abs(matrix).sum(axis=(1, 2)) * np.abs(found).max(axis=1)
+    solution = jax.jit(jax.vmap(linear_solve.solve))(matrix, right)
+    backward = np.abs(np.einsum("bij,bj->bi", matrix, solution) - right).max(axis=1)
+    scale = np.abs(matrix).sum(axis=(1, 2)) * np.abs(solution).max(axis=1)
     assert (backward < 1e-14 * scale).all()
 
 
-def test_several_right_sides_are_solved_as_each_alone():
+def test_several_right_sides_are_solved_as_single_right_sides():
     draw = np.random.default_rng(2)
     matrix, right = draw.normal(size=(5, 5)), draw.normal(size=(5, 3))
-    each = np.stack([linear_solve.solve(matrix, right[:, k]) for k in range(3)], axis=1)
-    np.testing.assert_allclose(linear_solve.solve(matrix, right), each, rtol=1e-14)
+    by_column = np.stack([linear_solve.solve(matrix, right[:, k]) for k in range(3)], axis=1)
+    np.testing.assert_allclose(linear_solve.solve(matrix, right), by_column, rtol=1e-14)
     slope = jax.jacfwd(lambda b: linear_solve.solve(matrix, b))(right)
     np.testing.assert_allclose(slope, np.einsum("ij,kl->ikjl", np.linalg.inv(matrix), np.eye(3)), rtol=0, atol=1e-12)
 
 
-def test_derivatives_are_those_of_lapack():
+def test_derivatives_equal_derivatives_by_lapack():
     draw = np.random.default_rng(0)
     matrix, right = jnp.asarray(draw.normal(size=(5, 5))), jnp.asarray(draw.normal(size=5))
 

@@ -1,4 +1,4 @@
-"""Structures of pytrees as text: those of this package are rebuilt, all others are refused."""
+"""Structures of pytrees as text: structures of this package are rebuilt, all others are refused."""
 
 from typing import NamedTuple
 
@@ -6,12 +6,12 @@ import equinox as eqx
 import jax
 import pytest
 
-from vijax.batch.cell import Plan
 from vijax.model.flow import Membrane
-from vijax.model.laws import HuntCrossley
 from vijax.model.records import State
-from vijax.orbits.grazing import Clearance
-from vijax.runtime import structures
+from vijax.model.walls.laws import HuntCrossley
+from vijax.orbits.clearances import Clearance
+from vijax.runtime.compilation import structures
+from vijax.simulation.cell.cell import Plan
 
 
 class ForeignTuple(NamedTuple):
@@ -49,8 +49,8 @@ def test_a_structure_is_rebuilt(name):
     "tree",
     [ForeignTuple(1), ForeignRecord(1), [ForeignTuple(1)], {(1, 2): 3}, eqx.Partial(divmod, 1), Plan(until="window")],
 )
-def test_what_would_not_be_the_same_is_refused(tree):
-    """Objects of other packages, keys and static fields that JSON changes."""
+def test_a_structure_that_json_would_change_is_refused(tree):
+    """JSON changes objects of other packages, these keys and these static fields."""
     assert structures.to_json(tree) is None
 
 
@@ -64,10 +64,10 @@ def test_what_would_not_be_the_same_is_refused(tree):
         '["os:system", "leaf"]',
         '["vijax.nowhere:State"]',
         '["vijax.model.records:Status", "leaf"]',
-        '["vijax.runtime.structures:jax.jit", "leaf"]',
-        '["vijax.runtime.structures:eqx.Partial", "leaf", "leaf", "leaf"]',
+        '["vijax.runtime.compilation.structures:jax.jit", "leaf"]',
+        '["vijax.runtime.compilation.structures:eqx.Partial", "leaf", "leaf", "leaf"]',
         '["vijax.model.records:State", "leaf"]',
-        '["vijax.orbits.grazing:Clearance", "leaf"]',
+        '["vijax.orbits.clearances:Clearance", "leaf"]',
         '["vijax.model.records.State", "leaf"]',
         "[" * 100_000,
     ],

@@ -1,5 +1,5 @@
-"""The command `vijax`, to whose pages the scripts are doors.
+"""The command `vijax`.
 
-A page for each subcommand: its options in sections, what is checked before anything runs, the run under a progress
-bar, the closing lines. Begin with `sweep`; `main` finds the pages.
+Every module of `commands` is a subcommand: it checks the arguments, runs under a progress bar and prints the closing
+lines. `options` has the options that subcommands share. Begin with `commands/sweep`; `main` imports the subcommands.
 """

@@ -1,4 +1,4 @@
-"""What options say: axes and device of the texts they were given, one point of them, parts of a whole."""
+"""Conversion of option texts to axes, a device, one cell or a fraction, with the option's name in errors."""
 
 import math
 import re
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from vijax.cli.options import PHYSICAL
-from vijax.model.quantities import AXES, of_both_walls, whole
+from vijax.cli.options.options import PHYSICAL
+from vijax.model.quantities import AXES, both_walls_name, without_wall
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -19,26 +19,31 @@ if TYPE_CHECKING:
     from vijax.model.pair import ImpactPair
 
 
-def take_axes(given: dict[str, Any], defaults: Mapping[str, str]) -> dict[str, Any]:
-    """Take the values of the axes out of what was given.
+def take_axes(parameters: dict[str, Any], defaults: Mapping[str, str]) -> dict[str, Any]:
+    """Remove the axes from the parsed parameters, and return the values of each specified or default axis by name.
 
     Args:
-        given: What click parsed, by name; the axes leave it.
-        defaults: Texts of axes that count as given where no physical name is among those that are.
+        parameters: Parameters parsed by click, by name; all axes are removed from this dictionary.
+        defaults: Texts of default axes; ignored if a quantity with a unit, such as s or omega0, is specified in place
+            of d or kappa.
     """
-    from vijax.planes.axes import parse_axis
+    from vijax.maps.axes import parse_axis
 
-    axes = {name: given.pop(name) for name in list(given) if name in AXES}
+    axes = {name: parameters.pop(name) for name in list(parameters) if name in AXES}
     texts = {name: text for name, text in axes.items() if text is not None}
-    # The defaults come first, so that what is given besides makes panels of their plane.
+    # Default axes come first, so that they span the plane and further axes make panels.
+    # A quantity with a unit, such as s or omega0, selects the device of Tables I and II (of the paper) instead.
     if not PHYSICAL & set(texts):
-        taken = {*texts, *map(of_both_walls, texts)}
-        texts = {name: text for name, text in defaults.items() if name not in taken} | texts
+        specified = {*texts, *map(both_walls_name, texts)}
+        texts = {name: text for name, text in defaults.items() if name not in specified} | texts
     return {name: parse_axis(name, text) for name, text in texts.items()}
 
 
-def given_in_hertz() -> set[str]:
-    """Return the angular frequencies that the running command was given in Hz: as axes, or as NAME=VALUES along one."""
+def quantities_in_hertz() -> set[str]:
+    """Return the names of the angular frequencies that the user of the running command wrote in Hz.
+
+    A frequency is an axis option, such as --omega 2Hz, or the name in NAME=VALUES of --along or --over.
+    """
     from vijax.model import units
 
     context = click.get_current_context(silent=True)
@@ -47,22 +52,26 @@ def given_in_hertz() -> set[str]:
         name, _, text = texts.get(option, "").partition("=")
         texts[name] = text
     frequencies = [name for name, axis in AXES.items() if axis.unit == "rad/s" and name in texts]
-    return {name for name in frequencies if units.split(re.split("[:,]", texts[name])[0])[1] == "Hz"}
+    return {name for name in frequencies if units.split_unit(re.split("[:,]", texts[name])[0])[1] == "Hz"}
 
 
-def in_given_units(dataset: "xr.Dataset") -> "xr.Dataset":
-    """Return the dataset to be shown, with coordinates in Hz where the running command got them in Hz."""
-    found = {}
-    for name in given_in_hertz() & set(map(str, dataset.coords)):
+def in_command_units(dataset: "xr.Dataset") -> "xr.Dataset":
+    """Return the dataset for display: angular frequencies that the user wrote in Hz are converted back to Hz."""
+    coordinates = {}
+    for name in quantities_in_hertz() & set(map(str, dataset.coords)):
         angular = dataset[name].variable
-        found[name] = angular.copy(data=angular.values / (2 * math.pi))
+        coordinates[name] = angular.copy(data=angular.values / (2 * math.pi))
         symbol = angular.attrs.get("symbol", name)
-        found[name].attrs = angular.attrs | {"units": "Hz", "symbol": rf"{symbol} / 2 \pi"}
-    return dataset.assign_coords(found)
+        coordinates[name].attrs = angular.attrs | {"units": "Hz", "symbol": rf"{symbol} / 2 \pi"}
+    return dataset.assign_coords(coordinates)
 
 
 def device(constants: Iterable[str]) -> "Harvester":
-    """Make the device of Tables I and II with other constants, each written NAME=VALUE, with a unit or in SI."""
+    """Return the device of Tables I and II with some constants replaced.
+
+    Args:
+        constants: Texts NAME=VALUE; a value without a unit is in SI units.
+    """
     from vijax.model import units
     from vijax.model.device import Harvester, with_constants
 
@@ -75,50 +84,55 @@ def device(constants: Iterable[str]) -> "Harvester":
             raise ValueError(
                 f"set must name a constant that has no option of its own; got {text!r}; give --{name}={value}"
             )
-        number, unit = units.split(value)
+        number, unit = units.split_unit(value)
         try:
             values[name] = float(number)
         except ValueError:
             raise ValueError(f"set must be NAME=VALUE with a number; got {text!r}") from None
         if unit:
-            values[name] = units.with_unit(whole(name), values[name], unit, name)
-    with about("set"):
+            values[name] = units.with_unit(without_wall(name), values[name], unit, name)
+    with name_option_in_errors("set"):
         return with_constants(Harvester(), **values)
 
 
 @contextmanager
-def about(option: str) -> Iterator[None]:
-    """Name the option that a value came by in whatever is found wrong with it."""
+def name_option_in_errors(option: str) -> Iterator[None]:
+    """Prefix every ValueError and OSError raised inside the block with `--option: `."""
     try:
         yield
     except (ValueError, OSError) as error:
         raise type(error)(f"--{option}: {error}") from None
 
 
-def part(option: str, text: str) -> float:
-    """Read a part of a whole, written 5% or 0.05; what is more than the whole must be written in percent."""
+def parse_fraction(option: str, text: str) -> float:
+    """Parse a fraction, written 5% or 0.05; fractions above 1 must be written in percent."""
     percent = text.endswith("%")
     try:
         value = float(text.removesuffix("%")) / (100 if percent else 1)
     except ValueError:
-        raise ValueError(f"{option} must be a part such as 5% or 0.05; got {text!r}") from None
+        raise ValueError(f"{option} must be a fraction such as 5% or 0.05; got {text!r}") from None
     if value > 1 and not percent:
-        raise ValueError(f"{option} must be a part such as 5% or 0.05; got {text!r}; write {text}% if that is meant")
+        raise ValueError(
+            f"{option} must be a fraction such as 5% or 0.05; got {text!r}; write {text}% if that is meant"
+        )
     return value
 
 
-def at_one_point(
-    axes: Mapping[str, Any], device: "Harvester", wall: "Walls" = "soft"
-) -> "tuple[ImpactPair, Harvester]":
-    """Find the pair that the axes give, each by one number, and the device that has it."""
-    from vijax.model.device import realised
+def single_cell(axes: Mapping[str, Any], device: "Harvester", wall: "Walls" = "soft") -> "tuple[ImpactPair, Harvester]":
+    """Return the nondimensional pair that the axes specify, and the device that realises this pair.
+
+    Raises:
+        ValueError: If an axis has several values.
+    """
+    from vijax.maps.cells import cells
+    from vijax.model.device import pair_and_device
     from vijax.model.pair import WALLS
-    from vijax.planes.cells import cells
-    from vijax.runtime import checks
+    from vijax.runtime import validation
 
     for name, values in axes.items():
         if values.size != 1:
             raise ValueError(f"{name} must be one number here; got {values.size} of them")
-    checks.choice("wall", wall, WALLS)
-    given = cells({name: float(values.flat[0]) for name, values in axes.items()}, device, wall).quantities
-    return realised(device, {name: float(value) for name, value in given.items()}, wall)
+    validation.validate_choice("wall", wall, WALLS)
+    quantities = cells({name: float(values.flat[0]) for name, values in axes.items()}, device, wall).quantities
+    # The pair fixes s, omega0, r and beta; the device supplies all other constants.
+    return pair_and_device(device, {name: float(value) for name, value in quantities.items()}, wall)

@@ -1,4 +1,4 @@
-"""The lines that end a run: what was found, how fast, what was written."""
+"""Closing lines of a run: results, speed, and files written."""
 
 import time
 from collections import Counter
@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vijax.model.quantities import FREE_GAP, STARTS
-from vijax.runtime.pages import see
+from vijax.runtime.doc_pages import see
 
 if TYPE_CHECKING:
     import xarray as xr
 
+# Time when this module is imported, which is close to the start of the process.
 _STARTED = time.perf_counter()
 
 
@@ -24,20 +25,28 @@ def finish(
     plot: Path | None,
     picture: "Callable[[xr.Dataset, Path], Any]",
     overwrite: bool,
-    kept: bool = False,
+    store_written: bool = False,
     table: Path | None = None,
     rows_of: str = "",
 ) -> None:
-    """Write the store, unless the run did, the table and the picture; say what was found, written, and in what time.
+    """Write the store (unless `store_written`), the table and the picture, and print the closing lines.
 
-    The table has a row for every element of the variable `rows_of`, or of the dataset.
+    Args:
+        dataset: The result.
+        summary: Text with the results.
+        out, plot: Paths of store and picture; None for a file that is not written.
+        picture: Function that draws a dataset to a path.
+        overwrite: Whether to replace an existing store.
+        store_written: Whether the run has already written the store.
+        table: Path of the table; None for no table.
+        rows_of: Name of the variable with one table row per element; "" for a table of the whole dataset.
     """
-    if out is not None and not kept:
-        from vijax.planes.store import save
+    if out is not None and not store_written:
+        from vijax.maps.storage.store import save
 
         save(dataset, out, overwrite=overwrite)
     if table is not None:
-        from vijax.runtime.tables import write_dataset
+        from vijax.runtime.text_tables import write_dataset
 
         write_dataset(dataset, table, rows_of)
     if plot is not None:
@@ -46,60 +55,68 @@ def finish(
 
 
 def close(summary: str, *written: Path | None) -> None:
-    """Say what the run found, what was written and how long it all took."""
+    """Print the results, the paths of the written files (None is skipped) and the time since the process started."""
     click.echo(summary)
     click.echo(f"wrote {', '.join(str(path) for path in written if path)}")
     click.echo(f"{time.perf_counter() - _STARTED:.1f} s from start to end")
 
 
-def pace(count: int, seconds: float, unit: str = "cells") -> str:
-    """Say how much was done in what time."""
+def rate_text(count: int, seconds: float, unit: str = "cells") -> str:
+    """Return a text with the count, the time and the rate: 2,000 cells in 0.50 s, 4,000 cells/s."""
     rate = count / seconds
-    return f"{how_many(count, unit)} in {seconds:.2f} s, {rate:{',.0f' if rate >= 100 else '.3g'}} {unit}/s"
+    return f"{format_count(count, unit)} in {seconds:.2f} s, {rate:{',.0f' if rate >= 100 else '.3g'}} {unit}/s"
 
 
-def how_many(count: int, unit: str) -> str:
-    """Write a number of things, of which one has no plural: 1 cell, 2,000 cells."""
+def format_count(count: int, unit: str) -> str:
+    """Return a count with its unit, singular for 1: 1 cell, 2,000 cells."""
     return f"{count:,} {unit.removesuffix('s') if count == 1 else unit}"
 
 
 def flags(variable: "xr.DataArray") -> str:
-    """Count how often each value of a variable with CF flags occurs."""
+    """Return a text with the number of elements per flag name, for a variable of integers with CF flag attributes."""
     names = dict(zip(variable.flag_values, variable.flag_meanings.split(), strict=True))
     return tally(variable.values, names.get)
 
 
 def statuses(variable: "xr.DataArray", of: str = "cells") -> str:
-    """Count how often each status occurs; below, say what to do about those that are not OK."""
+    """Return a text with the number of cells per status, and a line of advice for each status other than OK.
+
+    `of` is the name of the counted elements in the text.
+    """
     from vijax.model.records import Status
 
-    found = [status for status in Status if status != Status.OK and (variable == status).any()]
-    advice = [f"    {status.name.lower()}: {status.advice}" for status in found]
+    present = [status for status in Status if status != Status.OK and (variable == status).any()]
+    advice = [f"    {status.name.lower()}: {status.advice}" for status in present]
     counted = f"{of} by status: {flags(variable)}"
-    return see("status", "\n".join([counted, *advice])) if found else counted
+    return see("status", "\n".join([counted, *advice])) if present else counted
 
 
 def limit_lines(dataset: "xr.Dataset", of: str = "cells") -> list[str]:
-    """Count the inadmissible cells by the limit that they break; nothing where the dataset has no such variable."""
+    """Return one line with the number of inadmissible cells per violated limit.
+
+    The list is empty if the dataset has no variable `violated_limits`. `of` is the name of the cells in the line.
+    """
     if "violated_limits" not in dataset:
         return []
-    from vijax.planes.outputs import LimitViolation
+    from vijax.maps.outputs import LimitViolation
 
     code = dataset["violated_limits"].values
-    names = ((one, one.name.lower().replace("_", " ")) for one in LimitViolation if one != LimitViolation.NONE)
-    counts = {name: int((code == one).sum()) for one, name in names}
+    names = ((limit, limit.name.lower().replace("_", " ")) for limit in LimitViolation if limit != LimitViolation.NONE)
+    counts = {name: int((code == limit).sum()) for limit, name in names}
     listed = ", ".join(f"{name} {count:,}" for name, count in counts.items() if count)
     bad = sum(counts.values())
-    said = f"inadmissible {of}: {bad:,} of {code.size:,}" + (f" ({listed})" if bad else "")
-    return [see("model", said) if bad else said]
+    line = f"inadmissible {of}: {bad:,} of {code.size:,}" + (f" ({listed})" if bad else "")
+    return [see("model", line) if bad else line]
 
 
 def wide_gap_lines(dataset: "xr.Dataset", command: str = "") -> list[str]:
-    """Return a line where a map of one start has wide level gaps, in which balls may fly for ever without an impact.
+    """Return a line of advice if a map with one start per cell has cells with gamma = 0 and a wide gap, else no line.
+
+    In a gap wider than 2/pi^2 motions without impacts exist, so that the attractor depends on the start.
 
     Args:
         dataset: A map with the coordinates d and gamma.
-        command: The command that has `--starts`, where it is another one.
+        command: Command that has the option `--starts`, with a final blank; "" if the running command has this option.
     """
     started = any(name in dataset.dims for name in STARTS) or dataset.attrs.get("starts", 1) > 1
     if started or not {"d", "gamma"} <= set(dataset.coords):
@@ -108,30 +125,37 @@ def wide_gap_lines(dataset: "xr.Dataset", command: str = "") -> list[str]:
 
 
 def wide_gap_advice(d: Any, gamma: Any, command: str = "") -> list[str]:
-    """Return the line of `wide_gap_lines` for gaps d and gravities gamma; nothing if no gap is wide."""
-    part = float(((d > FREE_GAP) & (gamma == 0)).mean())
-    if not part:
+    """Return the line of `wide_gap_lines` for gaps d and gravities gamma; an empty list if no gap is wide."""
+    fraction = float(((d > FREE_GAP) & (gamma == 0)).mean())
+    if not fraction:
         return []
-    where = "everywhere" if part == 1 else f"in {part:.1%} of the cells"
+    where = "everywhere" if fraction == 1 else f"in {fraction:.1%} of the cells"
     return [
-        f"d > 2/pi^2 on level ground {where}: the motion depends on the start, and this is that of one; "
+        f"d > 2/pi^2 at gamma = 0 {where}: the motion depends on the start, and this map has one start; "
         f"try {command}--starts 64"
     ]
 
 
 def harvest(P: float, power: float, error: float | None = None) -> str:
-    """Write harvested energy, with its standard error, and power: 2e-05 J per half period, 2e-05 W."""
+    """Return a text with the energy P, its standard error if known, and the power: 2e-05 J per half period, 2e-05 W."""
     off = "" if error is None else f" +- {error:.1g}"
     return f"{P:.6g}{off} J per half period, {power:.6g} W"
 
 
 def tally(values: Any, name: Callable[[Any], Any], order: Callable[[Any], Any] | None = None) -> str:
-    """Count how often each name occurs among values, the least values first, or those least by `order`."""
+    """Return a text with the number of values per name.
+
+    Args:
+        values: Array of values.
+        name: Function from a value to its name.
+        order: Function from a value to its sort key; by default names are in ascending order of their values.
+    """
     import numpy as np
 
     kinds, counts = np.unique(values, return_counts=True)
-    found: Counter[str] = Counter()
+    totals: Counter[str] = Counter()
     rows = zip(kinds.tolist(), counts.tolist(), strict=True)
     for kind, count in sorted(rows, key=lambda row: (order or float)(row[0])):
-        found[str(name(kind))] += count
-    return ", ".join(f"{word} {n:,}" for word, n in found.items())
+        # Several values may share a name: for example, all long periods are counted together.
+        totals[str(name(kind))] += count
+    return ", ".join(f"{word} {n:,}" for word, n in totals.items())

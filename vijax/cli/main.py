@@ -1,4 +1,4 @@
-"""The command `vijax`: a group of pages, each imported when it is asked for."""
+"""The command `vijax`: a group of subcommands, each imported on demand."""
 
 from importlib import import_module
 
@@ -28,16 +28,16 @@ _PAGES = {
 
 
 class Pages(click.Group):
-    """The group of subcommands. A page is a room of this folder, and what it is called there."""
+    """The group of subcommands. Each is a module of `vijax.cli.commands` with a command object of the module's name."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """List the subcommands in the order of help."""
         return list(_PAGES)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import the page of a subcommand."""
-        room = _PAGES.get(cmd_name)
-        return None if room is None else getattr(import_module(f"vijax.cli.{room}"), room)
+        """Import a subcommand and return it; None if there is none of that name."""
+        module = _PAGES.get(cmd_name)
+        return None if module is None else getattr(import_module(f"vijax.cli.commands.{module}"), module)
 
 
 @click.group(
@@ -56,5 +56,5 @@ def vijax(ctx: click.Context) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command and return its exit code; see `process.run`."""
+    """Run `vijax` with these arguments, by default `sys.argv[1:]`, and return the exit code of `process.run`."""
     return run(vijax, arguments)

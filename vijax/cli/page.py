@@ -1,4 +1,4 @@
-"""A subcommand whose help shows its options in sections, and ends with lines to copy."""
+"""A subcommand with sections of options in its help, and examples at the end."""
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -7,25 +7,25 @@ from typing import Any
 import click
 
 Sections = Mapping[str, Sequence[click.Parameter]]
-"""Options under the title that help shows them by."""
+"""Options by section title of help."""
 
 
 class ConstantOption(click.Option):
-    """An option that gives one field of the device: `--energy-ratio-limit 0.1` is `--set energy_ratio_limit=0.1`."""
+    """An option for one constant of the device: `--energy-ratio-limit 0.1` means `--set energy_ratio_limit=0.1`."""
 
 
 class Page(click.Command):
     """A subcommand of `vijax`, or a script.
 
     Attributes:
-        sections: Its options by title, in the order of help.
-        examples: Arguments that it may be called with.
+        sections: Options by title, in the order of help.
+        examples: Argument lines, shown at the end of help.
     """
 
     def __init__(
         self, name: str, callback: Callable[..., None], sections: Sections, examples: Sequence[str], epilog: str
     ) -> None:
-        """Take the options from the sections and the first words of help from the callback's docstring."""
+        """Take the options from the sections, and the description from the docstring of the callback."""
         self.sections, self.examples = sections, examples
         super().__init__(
             name,
@@ -37,24 +37,24 @@ class Page(click.Command):
         )
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; what options of single constants give is added to the constants of --set."""
+        """Run the command, with values of `ConstantOption` added to the constants of --set."""
         for option in self.params:
             if isinstance(option, ConstantOption) and (value := ctx.params.pop(str(option.name))) is not None:
                 ctx.params["constants"] += (f"{option.name}={value}",)
         return super().invoke(ctx)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write a section for each title; the last has --help too."""
-        shown = {title: list(_records(options, ctx)) for title, options in self.sections.items()}
-        shown[next(reversed(shown))].extend(_records([self.get_help_option(ctx)], ctx))
-        # One column for all of them, however long the names of a section are.
-        width = max(len(names) for rows in shown.values() for names, _ in rows)
-        for title, rows in shown.items():
+        """Write one section of options per title; the option --help is added to the last section."""
+        records = {title: list(_records(options, ctx)) for title, options in self.sections.items()}
+        records[next(reversed(records))].extend(_records([self.get_help_option(ctx)], ctx))
+        # The help texts of all sections start in one column.
+        width = max(len(names) for rows in records.values() for names, _ in rows)
+        for title, rows in records.items():
             with formatter.section(title):
                 formatter.write_dl([(names.ljust(width), text) for names, text in rows], col_max=width)
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the epilog, then the examples as they are typed: a line each, however long."""
+        """Write the epilog, then the examples; every example is one line that is not wrapped."""
         super().format_epilog(ctx, formatter)
         with formatter.section("Examples"):
             for arguments in self.examples:

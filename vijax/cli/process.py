@@ -1,6 +1,6 @@
-"""What the process of a command does: bad input is one line, warnings are, and every end has its exit code.
+"""The process of a command: one-line errors and warnings, confirmation of long runs, and exit codes.
 
-A page is one `door`, one run under `progress` and one `closing.finish`.
+A subcommand consists of argument checks within `usage_errors`, one run under `progress`, and one `closing.finish`.
 """
 
 import gc
@@ -17,20 +17,23 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from vijax.cli import signals
-from vijax.runtime.pages import see
+from vijax.runtime.doc_pages import see
 
 if TYPE_CHECKING:
-    from vijax.planes.estimate import Estimate
+    from vijax.maps.execution.estimate import Estimate
 
 
-# XLA takes this from its environment alone, which a library leaves as it is. Without it LLVM makes one long piece of
-# code of a loop over 64 lanes, which takes longer to compile, and a plane a twentieth longer to run.
+# The command sets this XLA option in the environment, its only source; a library must not change the environment.
+# Without the option LLVM unrolls loops over 64 lanes, so that compilation takes longer and a plane runs 5 % longer.
 _ROLLED = "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling"
 
 
 @contextmanager
-def door() -> Iterator[None]:
-    """Turn an error within into one line and exit code 2: bad input, before anything runs. A run may begin after it."""
+def usage_errors() -> Iterator[None]:
+    """Convert errors of a block of argument checks to a usage error: one line, and exit code 2.
+
+    A block without error is the end of the checks: from then on, Ctrl-C and SIGTERM are handled as during a run.
+    """
     try:
         yield
     except (ValueError, TypeError, OSError, ImportError) as error:
@@ -39,8 +42,8 @@ def door() -> Iterator[None]:
 
 
 def agree(expected: "Estimate", yes: bool) -> None:
-    """Ask whether a long run is meant, or refuse it where nobody can answer."""
-    if not expected.long or yes:
+    """Request confirmation of a run over an hour or 10 GB, unless `yes`; raise ValueError if there is no terminal."""
+    if not expected.needs_confirmation or yes:
         return
     if not sys.stdin.isatty():
         raise ValueError(
@@ -49,72 +52,76 @@ def agree(expected: "Estimate", yes: bool) -> None:
     click.confirm(f"{expected}: begin?", abort=True, err=True)
 
 
-def import_beside(module: str) -> None:
-    """Import what will be wanted at the end while XLA compiles or loads, which needs no Python."""
+def import_in_background(module: str) -> None:
+    """Import a module, needed at the end of the run, in a thread while XLA compiles without Python's lock."""
     threading.Thread(target=import_module, args=(module,), daemon=True).start()
 
 
 def run(command: click.Command, arguments: list[str] | None = None) -> int:
-    """Run a command and return its exit code, with which `leave` ends the process.
+    """Run a command and return its exit code, which `leave` expects.
 
-    It is 0; 1 if what is to be written could not be, or `doctor` found a wrong number; 2 after bad input, when nothing
-    was run; 130 after Ctrl-C and 143 after SIGTERM.
+    0: success. 1: an output could not be written, or `doctor` computed a wrong number. 2: the input is invalid, and
+    nothing was run. 130: Ctrl-C. 143: SIGTERM.
     """
     _open_streams()
     with signals.handled():
         try:
-            with _compiler_told(), _warnings_told():
+            with _xla_option(), _single_line_warnings():
                 return command.main(arguments, standalone_mode=False) or 0
         except click.ClickException as error:
             click.echo(f"error: {error.format_message()}", err=True)
             return 2
         except (click.Abort, KeyboardInterrupt) as error:
             cause = error.__cause__ or error
-            click.echo(f"stopped; {_kept(cause)}", err=True)
+            click.echo(f"stopped; {_file_note(cause)}", err=True)
             return 143 if isinstance(cause, signals.Terminated) else 130
         except OSError as error:
             where = f" ({error.filename})" if error.filename else ""
-            click.echo(f"error: {error.strerror or error}{where}; {_kept(error)}", err=True)
+            click.echo(f"error: {error.strerror or error}{where}; {_file_note(error)}", err=True)
             return 1
 
 
 def stop(note: str) -> NoReturn:
-    """End a run whose Ctrl-C, or SIGTERM, was caught to keep its results until then; the note says what is kept."""
+    """Raise the exception of the last Ctrl-C or SIGTERM, which the run caught to keep its partial results.
+
+    `note` describes the partial results in the message of the command.
+    """
     error = signals.stopped()
     error.add_note(note)
     raise error
 
 
 def command(main: Callable[[], int]) -> NoReturn:
-    """Run what is the whole process, and end the process with the exit code that it returns."""
-    signals.own_process()
+    """Run `main` and end the process with the exit code that it returns."""
+    signals.own_signals()
     leave(main())
 
 
 def leave(code: int) -> NoReturn:
-    """End the process with the exit code of `run`, at once where the run came to no end.
+    """End the process with the exit code of `run`.
 
-    A compiled call that is under way then cannot be stopped, and leaving as Python does would wait for it.
+    If the run was stopped or failed (a code other than 0 and 2), the process ends at once by `os._exit`, because a
+    regular exit of Python would wait for a compiled call in progress, which cannot be stopped.
     """
     if code == 0:
         signals.ignore()
     if code in (0, 2):
-        # What is left goes back to the system, with the process: to look through all of it first takes a third of a
-        # second where programs were traced.
+        # Skip the last garbage collection, which takes a third of a second after JAX has traced; the system frees the
+        # memory of an ended process anyway.
         gc.freeze()
         sys.exit(code)
     os._exit(code)
 
 
 def _open_streams() -> None:
-    """Open the standard streams that are closed, on the null device, and let none of them fail at a character.
+    """Open closed standard streams on the null device, and escape printed characters that a stream cannot encode.
 
-    A file that is opened while descriptor 2 is closed becomes descriptor 2, and what a library writes to the standard
-    error goes into the file.
+    If descriptor 2 is closed, the next file opened becomes descriptor 2, and messages of libraries to the standard
+    error would be written into that file.
     """
     descriptor = os.open(os.devnull, os.O_RDWR)
     while descriptor <= 2:
-        os.set_inheritable(descriptor, True)  # processes that this one starts need it, too
+        os.set_inheritable(descriptor, True)  # child processes inherit the standard streams
         descriptor = os.dup(descriptor)
     os.close(descriptor)
     for name in ("stdout", "stderr"):
@@ -122,41 +129,41 @@ def _open_streams() -> None:
         if stream is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, open until the process ends
         elif isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # what a terminal cannot show must not end a finished run
+            stream.reconfigure(errors="backslashreplace")  # an unencodable character must not fail a finished run
 
 
 @contextmanager
-def _compiler_told() -> Iterator[None]:
-    """Have XLA leave loops of lanes as they are, unless its environment says something of the kind already."""
-    said = os.environ.get("XLA_FLAGS")
-    if "xla_backend_extra_options" not in (said or ""):
-        os.environ["XLA_FLAGS"] = f"{said or ''} {_ROLLED}".strip()
+def _xla_option() -> Iterator[None]:
+    """Set XLA's option against unrolled loops during the block, unless the user's XLA_FLAGS set backend options."""
+    flags = os.environ.get("XLA_FLAGS")
+    if "xla_backend_extra_options" not in (flags or ""):
+        os.environ["XLA_FLAGS"] = f"{flags or ''} {_ROLLED}".strip()
     try:
         yield
     finally:
         os.environ.pop("XLA_FLAGS")
-        if said is not None:
-            os.environ["XLA_FLAGS"] = said
+        if flags is not None:
+            os.environ["XLA_FLAGS"] = flags
 
 
 @contextmanager
-def _warnings_told() -> Iterator[None]:
-    """Turn what vijax warns of into one line, told once."""
+def _single_line_warnings() -> Iterator[None]:
+    """Print each distinct warning of vijax once, as one line."""
     from tqdm import tqdm
 
-    told: set[str] = set()
+    printed: set[str] = set()
 
-    def tell(message: Warning | str, *_: Any, **__: Any) -> None:
-        if str(message) not in told:
-            told.add(str(message))
-            tqdm.write(f"warning: {message}", file=sys.stderr)  # beside a bar that may be there
+    def print_once(message: Warning | str, *_: Any, **__: Any) -> None:
+        if str(message) not in printed:
+            printed.add(str(message))
+            tqdm.write(f"warning: {message}", file=sys.stderr)  # keeps a progress bar below the printed line
 
     with warnings.catch_warnings():
         warnings.filterwarnings("always", category=UserWarning, module="vijax")
-        warnings.showwarning = tell
+        warnings.showwarning = print_once
         yield
 
 
-def _kept(error: BaseException) -> str:
-    """Say what became of the files of a run that came to no end."""
+def _file_note(error: BaseException) -> str:
+    """Return the notes of the error on the written files; by default, that no half-written file is left."""
     return " ".join(getattr(error, "__notes__", ["nothing half-written is left"]))

@@ -1,4 +1,4 @@
-"""A progress bar, and what stands before it while nothing is done yet."""
+"""Progress bar of a run; until the first step is done, its description is the current stage, such as compilation."""
 
 import logging
 import sys
@@ -8,20 +8,20 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
-from vijax.cli.closing import pace
+from vijax.cli.closing import rate_text
 
 T = TypeVar("T")
 
 _WAITING = logging.getLogger("vijax.waiting")
-_MANY = 10_000  # From so many on a bar counts by thousands.
+_MANY = 10_000  # bars with at least this total write counts with a prefix, as 12.3k
 
 
 @contextmanager
 def progress(total: int, unit: str = "cells") -> Iterator[Callable[[int, int], None]]:
-    """Show a progress bar that says what is being waited for, as the callback (done, in all) that runs take."""
+    """Show a progress bar during the block; yield a function (done, total) that updates the bar."""
     from tqdm import tqdm
 
-    with tqdm(total=total, desc="starting", unit=unit, unit_scale=total >= _MANY) as bar, _told_of_waiting(bar):
+    with tqdm(total=total, desc="starting", unit=unit, unit_scale=total >= _MANY) as bar, _description_from_log(bar):
 
         def show(done: int, total: int) -> None:
             if done:
@@ -33,30 +33,35 @@ def progress(total: int, unit: str = "cells") -> Iterator[Callable[[int, int], N
 
 
 def counted(total: int, run: Callable[[Callable[[int, int], None]], T]) -> tuple[T, str]:
-    """Run under a progress bar that counts cells; return what was found and how fast, in words."""
-    # Numbers of cells done; at first those that a store held already.
-    told: list[int] = []
+    """Call `run` with a function that updates a progress bar of cells; return the result and a line with the rate.
+
+    Args:
+        total: Number of cells.
+        run: Function that computes the cells and reports (done, total) to its argument.
+    """
+    # Reported numbers of finished cells; the first is the number of cells that a store contained before the run.
+    done_counts: list[int] = []
 
     with progress(total) as show:
 
-        def tell(done: int, total: int) -> None:
-            told.append(done)
+        def report(done: int, total: int) -> None:
+            done_counts.append(done)
             show(done, total)
 
         began = time.perf_counter()
-        found = run(tell)
-    said = pace(told[-1] - told[0], time.perf_counter() - began)
-    return found, f"{said}, {told[0]:,} were there" if told[0] else said
+        result = run(report)
+    rate = rate_text(done_counts[-1] - done_counts[0], time.perf_counter() - began)
+    return result, f"{rate}, {done_counts[0]:,} already stored" if done_counts[0] else rate
 
 
-def waiting(what: str) -> None:
-    """Say at the progress bar what is being waited for."""
-    _WAITING.info(what)
+def waiting(stage: str) -> None:
+    """Set the description of the progress bar, if one is shown, to the current stage."""
+    _WAITING.info(stage)
 
 
 @contextmanager
-def _told_of_waiting(bar: Any) -> Iterator[None]:
-    """Show before the bar what vijax says it waits for; its clock goes on while nothing is done."""
+def _description_from_log(bar: Any) -> Iterator[None]:
+    """Show messages of the logger "vijax.waiting" as the bar's description, and redraw the elapsed time each second."""
     handler, ended = logging.Handler(), threading.Event()
     handler.emit = lambda record: bar.set_description(record.getMessage())  # type: ignore[method-assign]
 
@@ -64,12 +69,12 @@ def _told_of_waiting(bar: Any) -> Iterator[None]:
         while not ended.wait(1.0):
             bar.refresh()
 
-    level, passed_on = _WAITING.level, _WAITING.propagate
+    level, propagate = _WAITING.level, _WAITING.propagate
     _WAITING.addHandler(handler)
     _WAITING.setLevel(logging.INFO)
-    _WAITING.propagate = False  # the bar shows it, and nothing else twice
+    _WAITING.propagate = False  # the bar shows the message; other handlers must not repeat it
     clock = threading.Thread(target=tick, daemon=True)
-    if sys.stderr.isatty():  # a log would fill with it
+    if sys.stderr.isatty():  # not in a log file, where every refresh would add a line
         clock.start()
     try:
         yield
@@ -77,4 +82,4 @@ def _told_of_waiting(bar: Any) -> Iterator[None]:
         ended.set()
         _WAITING.removeHandler(handler)
         _WAITING.setLevel(level)
-        _WAITING.propagate = passed_on
+        _WAITING.propagate = propagate

@@ -1,8 +1,9 @@
-"""What Ctrl-C and SIGTERM do to the process of a command, and which exit code they give it.
+"""Handling of Ctrl-C and SIGTERM in the process of a command, and their exit codes.
 
-Until a run begins nothing is written, and a signal ends the process at once. An exception would not: where it is raised
-in a callback of the interpreter, of which imports call hundreds, Python prints it and goes on. Once a run has begun a
-signal raises an exception, so that the run keeps its results; an exception that Python drops is raised again.
+Before a run begins, nothing is written, and a signal ends the process at once. A signal handler that raises an
+exception would be unreliable during imports: they run hundreds of callbacks of the interpreter (of weak references, for
+example), and Python only prints an exception that such a callback raises. During a run a signal raises an exception, so
+that the run keeps its results. If this happens in such a callback, a timer raises the exception again.
 """
 
 import os
@@ -17,22 +18,22 @@ from typing import Any, ClassVar, NoReturn
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 STOPPED = "stopped; nothing half-written is left"
 
-_REPEATED = 1.0  # seconds in which a further signal is taken for the one that is being handled
-_AGAIN = 0.01  # seconds after which a dropped exception is raised again: outside of the callback that dropped it
+_REPEATED = 1.0  # a signal within this number of seconds after one that raised an exception is ignored
+_AGAIN = 0.01  # seconds until an exception lost in a callback is raised again, after the callback has ended
 
 
 class Terminated(KeyboardInterrupt):
-    """Raised by SIGTERM."""
+    """The exception that SIGTERM raises during a run; Ctrl-C raises KeyboardInterrupt."""
 
 
 class SignalState:
-    """What the handlers know of this process.
+    """State of the signal handlers of this process.
 
     Attributes:
-        owned: Whether it is the process of a command alone, which a signal may end at once.
+        owned: Whether the process runs nothing but the command, so that a signal may end the process at once.
         running: Whether a run has begun.
-        last: When a signal last raised an exception, by the monotonic clock.
-        received: The signals that raised one.
+        last: Time on the monotonic clock when a signal last raised an exception.
+        received: Numbers of the signals that raised an exception, the latest last.
     """
 
     owned = False
@@ -41,15 +42,15 @@ class SignalState:
     received: ClassVar[list[int]] = []
 
 
-def own_process() -> None:
-    """End this process at a signal, until a run begins. To be called first, by what is the whole process."""
+def own_signals() -> None:
+    """Let a signal end this process at once until a run begins; for a process that runs nothing but a command."""
     SignalState.owned = True
     _install()
 
 
 @contextmanager
 def handled() -> Iterator[None]:
-    """Handle signals while a command runs; afterwards as before, unless the process is owned."""
+    """Handle signals while a command runs; afterwards restore the earlier handlers, unless `SignalState.owned`."""
     if not _in_main_thread():
         yield
         return
@@ -57,7 +58,7 @@ def handled() -> Iterator[None]:
     SignalState.running, SignalState.last = False, -_REPEATED
     SignalState.received.clear()
     _install()
-    sys.unraisablehook = _raised_again(hook)
+    sys.unraisablehook = _reraising_hook(hook)
     try:
         yield
     finally:
@@ -69,19 +70,19 @@ def handled() -> Iterator[None]:
 
 
 def begin_run() -> None:
-    """Raise an exception at a signal from now on."""
+    """Mark the begin of a run: from now on, signals raise an exception instead of ending the process."""
     SignalState.running = True
 
 
 def ignore() -> None:
-    """Ignore signals: all is done, and the process ends."""
+    """Ignore signals from now on, because the work is finished and the process is about to end."""
     if _in_main_thread():
         for number in CODES:
             signal.signal(number, signal.SIG_IGN)
 
 
 def stopped() -> KeyboardInterrupt:
-    """Return the exception of the signal that came last."""
+    """Return a new exception for the last received signal: `Terminated` for SIGTERM, else KeyboardInterrupt."""
     return Terminated() if SignalState.received[-1:] == [signal.SIGTERM] else KeyboardInterrupt()
 
 
@@ -92,7 +93,7 @@ def _in_main_thread() -> bool:
 
 
 def _install() -> None:
-    """Install the handler, except for a signal that whoever started this process has it ignore."""
+    """Install the handler of Ctrl-C and SIGTERM, except for signals that the parent process has set to be ignored."""
     for number in CODES:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _handle)
@@ -107,7 +108,7 @@ def _handle(number: int, frame: FrameType | None) -> None:
 
 def _quit(number: int) -> NoReturn:
     with suppress(OSError):
-        os.write(2, f"{STOPPED}\n".encode())  # sys.stderr may be in the middle of a line
+        os.write(2, f"{STOPPED}\n".encode())  # not by sys.stderr, which the signal may have interrupted
     os._exit(CODES[signal.Signals(number)])
 
 
@@ -117,8 +118,11 @@ def _raise(number: int) -> NoReturn:
     raise stopped()
 
 
-def _raised_again(hook: Any) -> Any:
-    """Return a hook for dropped exceptions that lets the alarm raise those of signals again."""
+def _reraising_hook(hook: Any) -> Any:
+    """Return a replacement of `sys.unraisablehook`: a timer raises the lost exception of a signal again.
+
+    All other exceptions are passed to the original `hook`.
+    """
 
     def dropped(unraisable: Any) -> None:
         if unraisable.exc_type is None or not issubclass(unraisable.exc_type, KeyboardInterrupt):

@@ -1,5 +1,6 @@
-"""The device that harvests most.
+"""Optimisation of a device for harvested power.
 
-What may vary, where ascents begin, the ascent, tolerances, what lies around an optimum, and the report on it. Begin
-with `optimise`.
+Tuned quantities, surveys of devices (`survey`), gradient ascents on orbits, ensembles for aperiodic motion
+(`aperiodic`), tolerances and the surroundings of an optimum (`robustness`), and the report. Begin with `optimise`, then
+`design_search`.
 """

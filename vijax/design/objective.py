@@ -1,4 +1,10 @@
-"""What a design maximises, as an optimiser looks at it: the objective over all tolerances, the margins, derivatives."""
+"""Objectives of a design for the ascents: value over the nodes of the tolerances, margins, and derivatives of both.
+
+A node is a device with constants scattered by the tolerances; without tolerances there is one node. For each node
+Newton's method solves for the periodic orbit, and the steady state on the orbit (`orbits.steady`) gives value, margins
+and exact derivatives. With weights w_i and energies P_i of the nodes, the objective "mean" is log sum_i w_i P_i, and
+"worst" is min_i log P_i, with the gradient of a soft minimum.
+"""
 
 from functools import partial
 from typing import NamedTuple
@@ -9,43 +15,51 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from vijax.design.ascent import Look
-from vijax.model import variables
+from vijax.design.ascent import Evaluation
+from vijax.model import tuned_quantities
 from vijax.model.choices import Objective
 from vijax.model.device import Harvester
 from vijax.model.records import Status
-from vijax.model.sides import at
+from vijax.model.walls.sides import at_wall
 from vijax.orbits import shooting, steady
 from vijax.orbits.shooting import Sequence
-from vijax.runtime.programs import jitted
+from vijax.runtime.compilation.programs import jitted
 
 OBJECTIVES: dict[Objective, str] = {
     "P": "energy harvested per half forcing period [J]",
     "power": "harvested power [W]",
     "speed": "largest speed into a wall [m/s]",
-    "mean": "mean of P over the tolerances, a device whose orbit is lost counting nothing [J]",
+    "mean": "mean of P over the tolerances, a device without the orbit counting as 0 [J]",
     "worst": "least P over the tolerances [J]",
     "expected": "mean of P over all starts, each attractor by its share of them, and over the tolerances [J]",
 }
-_STEPS = 4  # so many lead from the nominal orbit to that of a device off by its tolerance
-_MOST_ITERATIONS = 16  # Newton's search near a known orbit gives up after so many: lost ones take them all
-_SHARP = 300.0  # how nearly the soft minimum, whose gradient stands for the worst case's, is the minimum
-_MOST = 20.0  # logarithms of margins end here: no contact, no voltage
+_CONTINUATION_STEPS = 4  # continuation steps from the nominal orbit to the orbit of a device at its tolerance
+_MAX_ITERATIONS = 16  # largest number of iterations of Newton's method; only lost orbits use all
+_SOFTMIN_SHARPNESS = 300.0  # factor on log P in the soft minimum that gives the gradient of "worst"
+_LARGEST_MARGIN = 20.0  # cap on margins, which are infinite without contact or voltage
 
 
-class Batch(eqx.Module):
-    """Starts that climb together: device, walls and knots of each, variables and their bounds."""
+class AscentBatch(eqx.Module):
+    """Starts of one batch of ascents: device, walls in order of impact, impact unknowns, variables and bounds."""
 
     device: Harvester
     sequence: Sequence
-    knots: Float[Array, "start impact 3"]
+    impact_unknowns: Float[Array, "start impact 3"]
     z: Float[Array, "start variable"]
     low: Float[Array, "start variable"]
     high: Float[Array, "start variable"]
 
 
-class Scene(eqx.Module):
-    """What every start shares."""
+class ObjectiveSpec(eqx.Module):
+    """Objective, tuned quantities and tolerances, shared by all starts.
+
+    Attributes:
+        factors, weights: Factors on the scattered constants at each node of the tolerances, and the weight of the node.
+            Node 0 is the nominal device.
+        names: Names of the tuned quantities.
+        scattered: Names of the scattered constants.
+        objective: One of `OBJECTIVES`.
+    """
 
     factors: Float[Array, "node constant"]
     weights: Float[Array, " node"]
@@ -54,123 +68,147 @@ class Scene(eqx.Module):
     objective: str = eqx.field(static=True)
 
     def device(self, device: Harvester, z, factors) -> Harvester:
-        """Make the device with tuned quantities and scattered constants."""
-        return variables.scattered(variables.tuned(device, self.names, z), self.scattered, factors)
+        """Return the device with tuned quantities and scattered constants."""
+        return tuned_quantities.with_factors(
+            tuned_quantities.tune_device(device, self.names, z), self.scattered, factors
+        )
 
 
-class _SeenOrbit(NamedTuple):
-    """Of one device: logarithm of the objective and of the margins, and the knots."""
+class _OrbitValues(NamedTuple):
+    """Values at one device: logarithm of the objective, margins ln(limit / value), and impact unknowns of the orbit."""
 
     value: Float[Array, ""]
     margins: Float[Array, " constraint"]
-    knots: Float[Array, "impact 3"]
+    impact_unknowns: Float[Array, "impact 3"]
 
 
-def _measure(scene: Scene, device: Harvester, sequence: Sequence, factors, knots, residual, z):
-    """Compute the objective at an orbit as a function of the variables, and the status."""
-    own = scene.device(device, z, factors)
-    there = steady.response(own, own.pair(), sequence, knots, residual)
-    value = {"power": there.power, "speed": there.speed}.get(scene.objective, there.P)
-    real, one = sequence.real, jnp.ones_like(there.depth)
-    deep = jnp.log(at(own.depth_limit, sequence.side) / jnp.where(real, there.depth, one))
-    rich = jnp.log(own.energy_ratio_limit * jnp.where(real, there.work, one) / jnp.where(real, there.energy, one))
-    margins = jnp.concatenate([jnp.where(real, x, _MOST) for x in (deep, rich)])
-    seen = _SeenOrbit(jnp.log(value), jnp.minimum(margins, _MOST), there.knots)
-    return seen, (seen, there.status)
+def _measure(spec: ObjectiveSpec, device: Harvester, sequence: Sequence, factors, impact_unknowns, residual, z):
+    """Return (values, (values, status)) of an orbit as a function of the variables z.
+
+    `jacfwd` with `has_aux` replaces the first copy of the values by derivatives and returns the second copy unchanged.
+    """
+    tuned_device = spec.device(device, z, factors)
+    response = steady.steady_on_orbit(tuned_device, tuned_device.pair(), sequence, impact_unknowns, residual)
+    value = {"power": response.power, "speed": response.speed}.get(spec.objective, response.P)
+    real, unit_values = sequence.real, jnp.ones_like(response.depth)
+    depth_margins = jnp.log(
+        at_wall(tuned_device.depth_limit, sequence.side) / jnp.where(real, response.depth, unit_values)
+    )
+    # Margins are log(limit / value); padding impacts get the largest margin.
+    energy_margins = jnp.log(
+        tuned_device.energy_ratio_limit
+        * jnp.where(real, response.work, unit_values)
+        / jnp.where(real, response.energy, unit_values)
+    )
+    margins = jnp.concatenate([jnp.where(real, x, _LARGEST_MARGIN) for x in (depth_margins, energy_margins)])
+    orbit_values = _OrbitValues(jnp.log(value), jnp.minimum(margins, _LARGEST_MARGIN), response.impact_unknowns)
+    return orbit_values, (orbit_values, response.status)
 
 
-class Known(NamedTuple):
-    """The orbits of every start's nodes, and how they move with the variables."""
+class NodeOrbits(NamedTuple):
+    """Orbits of all nodes and their slopes in the variables; `exists` is False where an orbit is lost."""
 
-    knots: Float[Array, "start node impact 3"]
+    impact_unknowns: Float[Array, "start node impact 3"]
     slopes: Float[Array, "start node impact 3 variable"]
-    there: Bool[Array, "start node"]
+    exists: Bool[Array, "start node"]
 
 
-def _settled(scene: Scene, batch: Batch, z, factors, guess):
-    """Find knots and residuals [start, node] of the orbits near guesses."""
-    one = lambda device, z, factors: scene.device(device, z, factors).pair()  # noqa: E731
-    pair = jax.vmap(jax.vmap(one, in_axes=(None, None, 0)))(batch.device, z, factors)
+def _solve_orbits(spec: ObjectiveSpec, batch: AscentBatch, z, factors, guess):
+    """Solve for the orbits from initial values; return impact unknowns and residuals [start, node, ...]."""
+    make_pair = lambda device, z, factors: spec.device(device, z, factors).pair()  # noqa: E731
+    pair = jax.vmap(jax.vmap(make_pair, in_axes=(None, None, 0)))(batch.device, z, factors)
     starts, count = guess.shape[:2]
     sequence = jax.tree.map(lambda x: jnp.repeat(x, count, axis=0), batch.sequence)
     flat = jax.tree.map(lambda x: x.reshape(starts * count, *x.shape[2:]), (pair, guess))
-    found = shooting.newton(flat[0], sequence, flat[1], _MOST_ITERATIONS)
-    return jax.tree.map(lambda x: x.reshape(starts, count, *x.shape[1:]), (found.knots, found.residual))
+    solution = shooting.newton(flat[0], sequence, flat[1], _MAX_ITERATIONS)
+    return jax.tree.map(lambda x: x.reshape(starts, count, *x.shape[1:]), (solution.impact_unknowns, solution.residual))
 
 
-def begin(scene: Scene, batch: Batch) -> Known:
-    """Follow the orbits of all nodes in a few steps from the nominal ones."""
-    starts, count = batch.z.shape[0], scene.weights.size
-    wide = jnp.broadcast_to(scene.factors, (starts, *scene.factors.shape))
+def follow_node_orbits(spec: ObjectiveSpec, batch: AscentBatch) -> NodeOrbits:
+    """Return initial values for the orbits of all nodes, by continuation from the nominal orbits."""
+    starts, count = batch.z.shape[0], spec.weights.size
+    factors = jnp.broadcast_to(spec.factors, (starts, *spec.factors.shape))
 
-    def onward(step, knots):
-        part = wide ** (step.astype(wide.dtype) / _STEPS)
-        return _settled(scene, batch, batch.z, part, knots)[0]
+    def follow(step, impact_unknowns):
+        # Step k, 0 to 3, raises the factors to the power k / 4. The caller solves with the factors themselves.
+        partial_factors = factors ** (step.astype(factors.dtype) / _CONTINUATION_STEPS)
+        return _solve_orbits(spec, batch, batch.z, partial_factors, impact_unknowns)[0]
 
-    knots = jnp.repeat(batch.knots[:, None], count, axis=1)
+    impact_unknowns = jnp.repeat(batch.impact_unknowns[:, None], count, axis=1)
     if count > 1:
-        knots = lax.fori_loop(0, _STEPS, onward, knots)
-    return Known(knots, jnp.zeros((*knots.shape, batch.z.shape[1]), knots.dtype), jnp.ones((starts, count), bool))
+        impact_unknowns = lax.fori_loop(0, _CONTINUATION_STEPS, follow, impact_unknowns)
+    return NodeOrbits(
+        impact_unknowns,
+        jnp.zeros((*impact_unknowns.shape, batch.z.shape[1]), impact_unknowns.dtype),
+        jnp.ones((starts, count), bool),
+    )
 
 
-def _orbits(scene: Scene, batch: Batch, z, near, known: Known):
-    """Find knots and residuals [start, node] of the orbits that follow from those near."""
-    guess = known.knots + (known.slopes * (z - near)[:, None, None, None]).sum(axis=-1)
-    # A device whose orbit was lost may have the nominal one again.
-    guess = jnp.where(known.there[..., None, None], guess, guess[:, :1])
-    factors = jnp.broadcast_to(scene.factors, (z.shape[0], *scene.factors.shape))
-    return _settled(scene, batch, z, factors, guess)
+def _predict_orbits(spec: ObjectiveSpec, batch: AscentBatch, z, near, node_orbits: NodeOrbits):
+    """Solve for the orbits at z, from linear predictions at `near`; return impact unknowns and residuals."""
+    # First-order prediction from the orbits at `near`.
+    guess = node_orbits.impact_unknowns + (node_orbits.slopes * (z - near)[:, None, None, None]).sum(axis=-1)
+    # If the orbit of a node was lost, Newton's method starts from the nominal orbit, which may recover the lost one.
+    guess = jnp.where(node_orbits.exists[..., None, None], guess, guess[:, :1])
+    factors = jnp.broadcast_to(spec.factors, (z.shape[0], *spec.factors.shape))
+    return _solve_orbits(spec, batch, z, factors, guess)
 
 
-def _over_all(function):
-    """Map a function of (device, sequence, factors, knots, residual, z) over starts and nodes."""
+def _map_starts_and_nodes(function):
+    """Map a function of (device, sequence, factors, impact unknowns, residual, z) over starts and nodes."""
     over_nodes = jax.vmap(function, in_axes=(None, None, 0, 0, 0, None))
     return jax.vmap(over_nodes, in_axes=(0, 0, None, 0, 0, 0))
 
 
-def look(scene: Scene, batch: Batch, z, near, known: Known) -> Look:
-    """See the objective of every start with its derivatives, for `ascent.ascend`."""
-    knots, residual = _orbits(scene, batch, z, near, known)
-    slope = jax.jacfwd(partial(_measure, scene), argnums=5, has_aux=True)
-    slopes, (seen, status) = _over_all(slope)(batch.device, batch.sequence, scene.factors, knots, residual, z)
-    fine, counts = status == Status.OK, scene.weights > 0
-    if scene.objective == "worst":
-        value = jnp.where(counts, seen.value, jnp.inf).min(axis=1)
-        share = jax.nn.softmax(jnp.where(counts, -_SHARP * seen.value, -jnp.inf), axis=1)
-        there = fine.all(axis=1)
+def evaluate_objective(spec: ObjectiveSpec, batch: AscentBatch, z, near, node_orbits: NodeOrbits) -> Evaluation:
+    """Evaluate objective and margins of every start at z, with derivatives, for `ascent.ascend`."""
+    impact_unknowns, residual = _predict_orbits(spec, batch, z, near, node_orbits)
+    # Forward mode is used because there are few variables and many outputs.
+    slope = jax.jacfwd(partial(_measure, spec), argnums=5, has_aux=True)
+    slopes, (orbit_values, status) = _map_starts_and_nodes(slope)(
+        batch.device, batch.sequence, spec.factors, impact_unknowns, residual, z
+    )
+    is_ok, counts = status == Status.OK, spec.weights > 0
+    if spec.objective == "worst":
+        value = jnp.where(counts, orbit_values.value, jnp.inf).min(axis=1)
+        # The value is the minimum itself; its gradient has the weights of the soft minimum.
+        share = jax.nn.softmax(jnp.where(counts, -_SOFTMIN_SHARPNESS * orbit_values.value, -jnp.inf), axis=1)
+        exists = is_ok.all(axis=1)
     else:
-        # Weights as they are: a device whose orbit is lost lowers the mean.
-        parts = jnp.where(fine & counts, jnp.log(scene.weights) + seen.value, -jnp.inf)
+        # A device with a lost orbit counts as P = 0 in the mean, so the weights are not renormalised.
+        parts = jnp.where(is_ok & counts, jnp.log(spec.weights) + orbit_values.value, -jnp.inf)
         value, share = jax.nn.logsumexp(parts, axis=1), jax.nn.softmax(parts, axis=1)
-        there = fine[:, 0]
-    rise = jnp.where((fine & counts)[..., None], slopes.value, 0.0)
-    # A lost device is held as the nominal one is: wide margins would make the barrier reward the loss.
-    margins = jnp.where(fine[..., None], seen.margins, seen.margins[:, :1])
-    steep = jnp.where(fine[..., None, None], slopes.margins, slopes.margins[:, :1])
+        # A mean exists if the nominal orbit exists; a worst case exists only if the orbits of all nodes exist.
+        exists = is_ok[:, 0]
+    value_slopes = jnp.where((is_ok & counts)[..., None], slopes.value, 0.0)
+    # A device with a lost orbit gets the margins of the nominal device. With large margins instead, the barrier would
+    # reward the loss of the orbit.
+    margins = jnp.where(is_ok[..., None], orbit_values.margins, orbit_values.margins[:, :1])
+    margin_slopes = jnp.where(is_ok[..., None, None], slopes.margins, slopes.margins[:, :1])
     flat = (z.shape[0], -1)
-    return Look(
+    return Evaluation(
         value=value,
-        gradient=(share[..., None] * rise).sum(axis=1),
+        gradient=(share[..., None] * value_slopes).sum(axis=1),
         margins=margins.reshape(flat),
-        slopes=steep.reshape(*flat, z.shape[1]),
-        there=there & jnp.isfinite(value),
-        memory=Known(seen.knots, slopes.knots, fine),
+        slopes=margin_slopes.reshape(*flat, z.shape[1]),
+        exists=exists & jnp.isfinite(value),
+        memory=NodeOrbits(orbit_values.impact_unknowns, slopes.impact_unknowns, is_ok),
     )
 
 
 @jitted
-def spread(scene: Scene, batch: Batch) -> tuple[Array, ...]:
-    """Compute mean and worst value of designs over tolerances, shares of those lost and inadmissible; see `Spread`."""
-    knots, residual = _orbits(scene, batch, batch.z, batch.z, begin(scene, batch))
-    measure = _over_all(partial(_measure, scene))
-    _, (seen, status) = measure(batch.device, batch.sequence, scene.factors, knots, residual, batch.z)
-    fine = status == Status.OK
-    kept = fine & (seen.margins.min(axis=-1) >= 0)
-    value = jnp.where(kept, jnp.exp(seen.value), 0.0)
-    counts = scene.weights > 0
+def spread_over_tolerances(spec: ObjectiveSpec, batch: AscentBatch) -> tuple[Array, ...]:
+    """Return mean and worst value, and lost and inadmissible shares, of each start, as in `ToleranceStatistics`."""
+    impact_unknowns, residual = _predict_orbits(spec, batch, batch.z, batch.z, follow_node_orbits(spec, batch))
+    measure = _map_starts_and_nodes(partial(_measure, spec))
+    _, (orbit_values, status) = measure(batch.device, batch.sequence, spec.factors, impact_unknowns, residual, batch.z)
+    is_ok = status == Status.OK
+    admissible = is_ok & (orbit_values.margins.min(axis=-1) >= 0)
+    value = jnp.where(admissible, jnp.exp(orbit_values.value), 0.0)
+    counts = spec.weights > 0
     return (
-        (scene.weights * value).sum(axis=1),
-        jnp.where(counts, jnp.where(fine, jnp.exp(seen.value), 0.0), jnp.inf).min(axis=1),
-        jnp.where(fine, 0.0, scene.weights).sum(axis=1),
-        jnp.where(fine & ~kept, scene.weights, 0.0).sum(axis=1),
+        (spec.weights * value).sum(axis=1),
+        jnp.where(counts, jnp.where(is_ok, jnp.exp(orbit_values.value), 0.0), jnp.inf).min(axis=1),
+        jnp.where(is_ok, 0.0, spec.weights).sum(axis=1),
+        jnp.where(is_ok & ~admissible, spec.weights, 0.0).sum(axis=1),
     )

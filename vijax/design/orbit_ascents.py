@@ -1,4 +1,4 @@
-"""Ascents along periodic orbits: from what a survey met, in compiled calls of few starts, to optima of each device."""
+"""Ascents of the objective on periodic orbits, from the orbits of a survey to verified optima."""
 
 import itertools
 from functools import lru_cache, partial
@@ -7,75 +7,97 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vijax.design import objective as aims
-from vijax.design.ascent import Box, Climb, ascend, converged
-from vijax.design.candidates import Begun
+from vijax.design import objective as design_objective
+from vijax.design.aperiodic.ensemble import DesignTask
+from vijax.design.ascent import AscentState, Box, ascend, converged
 from vijax.design.design_settings import DesignSettings
-from vijax.design.ensemble import Task
-from vijax.design.objective import Batch, Scene
-from vijax.design.optimum import End, VerifiedOptima, verified
-from vijax.design.tolerance import Nodes
-from vijax.runtime import context, tiles
-from vijax.runtime.programs import jitted
+from vijax.design.objective import AscentBatch, ObjectiveSpec
+from vijax.design.optimum import AscentEnd, VerifiedOptima, verify_ends
+from vijax.design.robustness.tolerance import Nodes
+from vijax.design.survey.orbit_candidates import AscentStarts
+from vijax.runtime import public_api, tiles
+from vijax.runtime.compilation.programs import jitted
 
-_WIDTHS = (4, 8)  # impacts that orbits are padded to, those of more to the most there may be
-# Starts of one compiled call. Those that end soon wait for the others, in Newton's search as in the ascent, and the
-# equations of more than a few orbits of 16 impacts leave the first cache: calls of 16 take 1.4 times as long.
-_TILE = 4
+_IMPACT_WIDTHS = (4, 8)  # orbits are padded to one of these numbers of impacts, or to the longest orbit
+# Number of starts of one compiled call. A larger number is slower (16 starts: 1.4 times the time), because starts that
+# end early wait for the others, and because the equations of many orbits with 16 impacts exceed the first-level cache.
+_STARTS_PER_CALL = 4
 
 
-def search(task: Task, starts: Begun, cloud: Nodes, max_evaluations: int) -> VerifiedOptima:
-    """Climb along the orbits of every device; give its optima, the best first, and ends that are none."""
-    scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), task.tune, cloud.names, task.objective)
-    ends = _climbed(scene, starts, task.box, max_evaluations, task.settings)
-    return verified(scene, starts, ends, task.devices, max_evaluations, task.settings)
+def climb_orbits(
+    task: DesignTask, starts: AscentStarts, tolerance_nodes: Nodes, max_evaluations: int
+) -> VerifiedOptima:
+    """Run the ascents from the orbits of all devices, and return verified optima and dropped ends of each device."""
+    spec = ObjectiveSpec(
+        jnp.asarray(tolerance_nodes.factors),
+        jnp.asarray(tolerance_nodes.weights),
+        task.tune,
+        tolerance_nodes.names,
+        task.objective,
+    )
+    ends = _climb(spec, starts, task.box, max_evaluations, task.settings)
+    return verify_ends(spec, starts, ends, task.devices, max_evaluations, task.settings)
 
 
 @lru_cache(maxsize=8)
 def _compiled(max_evaluations: int, settings: DesignSettings):
-    def climb(scene: Scene, batch: Batch) -> Climb:
+    """Return the compiled ascent for a largest number of evaluations and settings."""
+
+    def climb(spec: ObjectiveSpec, batch: AscentBatch) -> AscentState:
         box = Box(batch.low, batch.high, settings.max_step)
-        look = partial(aims.look, scene, batch)
-        return ascend(look, batch.z, aims.begin(scene, batch), box, max_evaluations, settings)
+        evaluate = partial(design_objective.evaluate_objective, spec, batch)
+        return ascend(
+            evaluate, batch.z, design_objective.follow_node_orbits(spec, batch), box, max_evaluations, settings
+        )
 
     return jitted(climb, often=True)
 
 
-def _climbed(scene: Scene, starts: Begun, box: np.ndarray, max_evaluations: int, settings: DesignSettings) -> list[End]:
-    """Climb from every start, in padded tiles on every core: orbits of few impacts and of many apart."""
-    count, work = (starts.flown.side != 0).sum(axis=1), _compiled(max_evaluations, settings)
-    ends: list[End | None] = [None] * count.size
+def _climb(
+    spec: ObjectiveSpec, starts: AscentStarts, box: np.ndarray, max_evaluations: int, settings: DesignSettings
+) -> list[AscentEnd]:
+    """Climb from every start and return the ends. Orbits are grouped by number of impacts into tiles for all cores."""
+    count, program = (starts.orbits.side != 0).sum(axis=1), _compiled(max_evaluations, settings)
+    ends: list[AscentEnd | None] = [None] * count.size
 
-    def part(some: np.ndarray, width: int, tile: tiles.Tile) -> None:
-        rows = some[tile.rows]
-        own, bounds = starts.some(rows), box[starts.owner[rows]].swapaxes(0, 1)
-        begun = (jnp.asarray(x) for x in (own.flown.knots[:, :width], own.z, *bounds))
-        end = work(scene, Batch(jax.tree.map(jnp.asarray, own.device), own.flown.sequence(width), *begun))
-        seen, lost, settled, taken = (
-            jax.tree.map(np.asarray, x) for x in (end.seen, end.lost, converged(end), end.evaluations)
+    def climb_tile(group: np.ndarray, width: int, tile: tiles.Tile) -> None:
+        """Climb from the starts of one tile and store their ends."""
+        rows = group[tile.rows]
+        tile_starts, bounds = starts.select(rows), box[starts.device_index[rows]].swapaxes(0, 1)
+        arrays = (jnp.asarray(x) for x in (tile_starts.orbits.impact_unknowns[:, :width], tile_starts.z, *bounds))
+        end = program(
+            spec,
+            AscentBatch(jax.tree.map(jnp.asarray, tile_starts.device), tile_starts.orbits.sequence(width), *arrays),
         )
-        path, heights, z = np.asarray(end.path), np.asarray(end.heights), np.asarray(end.z)
+        evaluation, reached_edge, has_converged, evaluations = (
+            jax.tree.map(np.asarray, x) for x in (end.evaluation, end.reached_edge, converged(end), end.evaluations)
+        )
+        path, path_objective, z = np.asarray(end.path), np.asarray(end.path_objective), np.asarray(end.z)
         for row, index in enumerate(rows[: tile.real]):
-            ends[index] = End(
+            ends[index] = AscentEnd(
                 z[row],
-                float(np.exp(seen.value[row])) if seen.there[row] else np.nan,
-                seen.gradient[row],
-                seen.margins[row],
-                seen.memory.knots[row, 0],
-                bool(lost[row]),
-                bool(settled[row]),
-                int(taken[row]),
+                # The ascent maximises the logarithm of the objective.
+                float(np.exp(evaluation.value[row])) if evaluation.exists[row] else np.nan,
+                evaluation.gradient[row],
+                evaluation.margins[row],
+                # Node 0 is the nominal device.
+                evaluation.memory.impact_unknowns[row, 0],
+                bool(reached_edge[row]),
+                bool(has_converged[row]),
+                int(evaluations[row]),
                 path[:, row],
-                heights[:, row],
+                path_objective[:, row],
             )
 
     jobs = []
-    most = starts.flown.side.shape[1]
-    widths = [0, *(width for width in _WIDTHS if width < most), most]
-    # The widest first, for they take longest: no core is left with one of them at the end.
-    for width, few in itertools.pairwise(reversed(widths)):
-        some = np.flatnonzero((count > few) & (count <= width))
-        jobs += [(some, width, tile) for tile in tiles.tiles(some.size, (_TILE,))]
-    with context.pool(tiles.workers()) as pool:
-        list(pool.map(lambda job: part(*job), jobs))
+    longest = starts.orbits.side.shape[1]
+    widths = [0, *(width for width in _IMPACT_WIDTHS if width < longest), longest]
+    # Orbits with most impacts come first. They take longest, and at the end would keep one core busy while others are
+    # idle.
+    for width, shorter in itertools.pairwise(reversed(widths)):
+        group = np.flatnonzero((count > shorter) & (count <= width))
+        jobs += [(group, width, tile) for tile in tiles.tiles(group.size, (_STARTS_PER_CALL,))]
+    with public_api.pool(tiles.workers()) as pool:
+        list(pool.map(lambda job: climb_tile(*job), jobs))
+    # Every start has an end, because it belongs to exactly one tile. The filter is for the type checker.
     return [end for end in ends if end is not None]

@@ -1,5 +1,5 @@
-"""A page in the browser that shows a map and, of the cell that is picked, its motion and what surrounds it.
+"""A page in the browser that shows a map, and the motion and the surroundings of a selected cell.
 
-The only folder that imports bokeh, and never before a page is asked for. Every panel shows the answer of a public
-function, which it names. Begin with `page`; what a panel computes stands in the room of its name.
+No other folder imports bokeh, which is loaded when a page is opened. `server` runs pages and their jobs. `analyses`
+computes the contents of the panels; every panel names the public function that computes its result. Begin with `page`.
 """

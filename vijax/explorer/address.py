@@ -1,35 +1,39 @@
-"""Where a server listens: what a port is, which addresses are of this machine alone, what an origin may be."""
+"""Address, port and allowed origins of the explorer's server, with their validation."""
 
 import errno
 import re
 import socket
 from typing import Any
 
+# Port that the server binds by default, and largest port number of TCP.
 PORT, MOST_PORT = 5006, 65535
+# Addresses that only programs on this machine can reach.
 LOCAL = ("127.0.0.1", "localhost", "::1")
 
-# A name or a number of a machine, in brackets if it has colons, and a port: no pattern that many would fit.
+# A host name, an IPv4 number or an IPv6 number in brackets, then optionally a port. The pattern has no nested
+# repetition over the same characters, so that matching takes linear time even on a text made to slow it down.
 _ORIGIN = re.compile(r"([A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?|\[[0-9A-Fa-f:.]+\])(:(?P<port>[0-9]{1,5}))?")
 
 
 def check_listener(address: Any, port: Any, allow_origin: Any) -> tuple[str, ...]:
-    """Give the origins of who may ask, if a server may listen there for them.
+    """Return the validated origins of the pages that may connect to a server at this address and port.
 
     Raises:
-        ValueError: No port, no origin, no address, or one that others can reach without an origin.
+        ValueError: The port or an origin is invalid, the address is no text, or other machines can reach the address
+            and no origin is specified.
     """
-    from vijax.runtime import checks  # here, as help is written without NumPy
+    from vijax.runtime import validation  # imported here, because it imports NumPy, which would slow down --help
 
-    checks.whole("port", port, 0, MOST_PORT)
-    given = [allow_origin] if isinstance(allow_origin, str) else allow_origin
-    origins = checks.sequence("allow_origin", given, str, "HOST:PORT, one or several")
-    for one in origins:
-        found = _ORIGIN.fullmatch(one)
-        if found is None or int(found["port"] or 0) > MOST_PORT:
-            must = "HOST or HOST:PORT, as it stands in the browser of who may ask"
-            raise ValueError(f"allow_origin must be {must}; got {checks.shown(one)}")
+    validation.validate_integer("port", port, 0, MOST_PORT)
+    specified = [allow_origin] if isinstance(allow_origin, str) else allow_origin
+    origins = validation.validate_records("allow_origin", specified, str, "HOST:PORT, one or several")
+    for origin in origins:
+        match = _ORIGIN.fullmatch(origin)
+        if match is None or int(match["port"] or 0) > MOST_PORT:
+            requirement = "HOST or HOST:PORT, as the browsers of the permitted users show it"
+            raise ValueError(f"allow_origin must be {requirement}; got {validation.value_text(origin)}")
     if not isinstance(address, str) or not address:
-        raise ValueError(f"address must be a text, such as 127.0.0.1; got {checks.shown(address)}")
+        raise ValueError(f"address must be a text, such as 127.0.0.1; got {validation.value_text(address)}")
     if address not in LOCAL and not origins:
         raise ValueError(
             f"address must come with allow_origin where others can reach it; got {address} alone; "
@@ -39,23 +43,23 @@ def check_listener(address: Any, port: Any, allow_origin: Any) -> tuple[str, ...
 
 
 def host_of(origin: str) -> str:
-    """Return the host of HOST or HOST:PORT, in small letters and without brackets."""
+    """Return the host of HOST or HOST:PORT, in lower case and without brackets."""
     host, colon, port = origin.rpartition(":")
     return (host if colon and port.isdecimal() else origin).strip("[]").lower()
 
 
 def bound_port(address: str, port: int) -> int:
-    """Find a port that nobody listens on, unless one is given, which has to be such.
+    """Return the specified port if it is free, or any free port if `port` is 0.
 
     Raises:
-        OSError: An address that is none of this machine's, or a port that is taken.
+        OSError: This machine does not have the address, or the port is in use.
     """
     try:
-        with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as one:
-            # As the server does: a port whose last server has just ended is free.
-            one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            one.bind((address, port))
-            return int(one.getsockname()[1])
+        with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as listener:
+            # As in Bokeh's server: with this option, a port is free as soon as the server that used it has ended.
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind((address, port))
+            return int(listener.getsockname()[1])
     except socket.gaierror:
         raise OSError(f"address must be one that this machine has; got {address}") from None
     except OSError as error:

@@ -1,163 +1,175 @@
-"""Fills the tables of a page with what was computed: a cell's motion, its line, its basins, its branch, the map."""
+"""Fills the tables of a page with results: a cell's motion, its line, its basins, its branch, the map."""
 
 from typing import Any
 
 import numpy as np
 
-from vijax.explorer.basin import CellBasin
-from vijax.explorer.branch import CellBranch
+from vijax.explorer.analyses.basin import CellBasin
+from vijax.explorer.analyses.branch import CellBranch
+from vijax.explorer.analyses.line import CellLine
+from vijax.explorer.analyses.motion import CellMotion
 from vijax.explorer.figures import PageFigures, PageTables, Walls, mapper
-from vijax.explorer.line import CellLine
-from vijax.explorer.motion import CellMotion
-from vijax.explorer.overlay import LaidCurves
+from vijax.explorer.overlay import DrawnCurves
 from vijax.explorer.plane import Axis, ExploredPlane
 from vijax.plots.cell_colours import ColouredMap, attractor_colours
 from vijax.plots.cells import runs
 from vijax.plots.curve_lines import FAINT
 
 MOST_PIXELS = 1024
-"""Colours of a map along an axis, at most: a larger map is shown by every so many-th cell."""
+"""Most pixels of a map along an axis; if a map has more cells, each pixel shows the cell at its position."""
 
 
 class Drawing:
-    """The tables and figures of one page, and how each is filled.
+    """The tables and figures of one page; every method draws one result.
 
     Attributes:
-        tables, figures, walls, bar: As `figures.figures` made them.
+        tables: Result of `figures.tables`.
+        figures, walls, bar: Result of `figures.figures`: the figures, their movable lines and the colour bar.
     """
 
     def __init__(self, tables: PageTables, figures: PageFigures, walls: Walls, bar: Any) -> None:
         self.tables, self.figures, self.walls, self.bar = tables, figures, walls, bar
 
-    def map(self, plane: ExploredPlane, found: ColouredMap) -> None:
-        """Draw the colours and marks of a map."""
-        of = self.tables
-        of.cells.data = _image(_pixels(plane, found.colours), plane.x, plane.y)
-        of.veil.data = _veil(plane, found.veiled)
-        of.border.data = dict(zip(("x0", "y0", "x1", "y1"), found.segments.T, strict=True))
-        of.dots.data = dict(zip("xy", found.dots, strict=True))
-        of.crosses.data = dict(zip("xy", found.crosses, strict=True))
-        of.star.data = _points([] if found.star is None else [found.star])
-        self.bar.visible = found.span is not None
-        if found.span is not None:
-            self.bar.color_mapper = mapper(found.span, found.log, found.palette)
+    def map(self, plane: ExploredPlane, coloured: ColouredMap) -> None:
+        """Draw the colours of a map, its marks and its colour bar."""
+        tables = self.tables
+        tables.cells.data = _image(_pixels(plane, coloured.colours), plane.x, plane.y)
+        tables.veil.data = _veil(plane, coloured.veiled)
+        tables.border.data = dict(zip(("x0", "y0", "x1", "y1"), coloured.segments.T, strict=True))
+        tables.dots.data = dict(zip("xy", coloured.dots, strict=True))
+        tables.crosses.data = dict(zip("xy", coloured.crosses, strict=True))
+        tables.star.data = _points([] if coloured.star is None else [coloured.star])
+        self.bar.visible = coloured.span is not None
+        if coloured.span is not None:
+            self.bar.color_mapper = mapper(coloured.span, coloured.log, coloured.palette)
 
-    def curves(self, found: LaidCurves) -> None:
-        """Draw curves over the map: those of unstable orbits alone faintly, and without an edge."""
-        of, pieces = self.tables, found.pieces
-        of.curves.data = {
-            "xs": [one.x for one in pieces],
-            "ys": [one.y for one in pieces],
-            "kind": [one.kind for one in pieces],
-            "label": [one.label for one in pieces],
-            "width": [_STRONG if one.stable else _WEAK for one in pieces],
-            "alpha": [1.0 if one.stable else FAINT for one in pieces],
-            "edge": [float(one.stable) for one in pieces],
+    def curves(self, curves: DrawnCurves) -> None:
+        """Draw curves over the map; segments that only unstable orbits border are faint and have no white edge."""
+        tables, pieces = self.tables, curves.pieces
+        tables.curves.data = {
+            "xs": [item.x for item in pieces],
+            "ys": [item.y for item in pieces],
+            "kind": [item.kind for item in pieces],
+            "label": [item.label for item in pieces],
+            "width": [_STRONG if item.stable else _WEAK for item in pieces],
+            "alpha": [1.0 if item.stable else FAINT for item in pieces],
+            "edge": [float(item.stable) for item in pieces],
         }
-        of.points.data = _points([one.place for one in found.points]) | {
-            "number": [str(one.number) for one in found.points]
+        tables.points.data = _points([item.parameters for item in curves.points]) | {
+            "number": [str(item.number) for item in curves.points]
         }
 
     def pick(self, x: float, y: float) -> None:
-        """Move the crosshair."""
+        """Move the crosshair to a cell."""
         if self.tables.pick.data == {"x": [x], "y": [y]}:
-            return  # the page's script has moved it already
+            return  # the page's script has already moved the crosshair at the click
         self.tables.pick.data = {"x": [x], "y": [y]}
         self.walls.across.location, self.walls.up.location = x, y
 
-    def stand(self, place: float) -> None:
-        """Put the lines that say where the cell is on the axis of line and branch."""
-        self.walls.line.location = self.walls.branch.location = place
+    def stand(self, position: float) -> None:
+        """Move the marks of the cell's axis value in the two figures of the line and of the branch."""
+        self.walls.line.location = self.walls.branch.location = position
 
-    def motion(self, found: CellMotion) -> None:
-        """Draw the phase plane, the course in time and the energies of impacts."""
-        of, half = self.tables, found.half
-        of.course.data = {"t": found.t, "x": found.u, "v": found.v}
-        of.membranes.data = {"t": found.t, "left": np.minimum(found.u, -half), "right": np.maximum(found.u, half)}
-        hits = found.impacts
-        of.impacts.data = {"t": hits["t"], "x": hits["u"], "v": hits["v"]}
-        good, bad = hits["admissible"] == 1, hits["admissible"] == 0
-        shown = {"given": (hits["given"] > 0, "given"), "harvested": (good, "harvested"), "refused": (bad, "harvested")}
-        energies = np.concatenate([hits["given"], hits["harvested"]]) * _MICRO
-        for name, (there, column) in shown.items():
-            there = there & (hits[column] > 0)
-            getattr(of, name).data = {"x": hits["t"][there], "y": _MICRO * hits[column][there]}
+    def motion(self, motion: CellMotion) -> None:
+        """Draw the phase plane, the displacement over time and the energies of the impacts."""
+        tables, half = self.tables, motion.half
+        tables.course.data = {"t": motion.t, "x": motion.u, "v": motion.v}
+        # A membrane follows the ball while the ball touches it, and is drawn at rest at u = -d/2 or d/2 otherwise.
+        tables.membranes.data = {
+            "t": motion.t,
+            "left": np.minimum(motion.u, -half),
+            "right": np.maximum(motion.u, half),
+        }
+        impacts = motion.impacts
+        tables.impacts.data = {"t": impacts["t"], "x": impacts["u"], "v": impacts["v"]}
+        admissible, inadmissible = impacts["admissible"] == 1, impacts["admissible"] == 0
+        energy_columns = {
+            "transferred": (impacts["transferred"] > 0, "transferred"),
+            "harvested": (admissible, "harvested"),
+            "inadmissible": (inadmissible, "harvested"),
+        }
+        energies = np.concatenate([impacts["transferred"], impacts["harvested"]]) * _MICRO
+        for name, (positive, column) in energy_columns.items():
+            # The energy axis is logarithmic, so that only positive energies can be drawn.
+            positive = positive & (impacts[column] > 0)
+            getattr(tables, name).data = {"x": impacts["t"][positive], "y": _MICRO * impacts[column][positive]}
         for walls in (self.walls.phase, self.walls.course):
             walls[0].location, walls[1].location = -half, half
-        at = self.figures
-        at.course.x_range.update(start=0.0, end=found.span)
-        _span(at.phase.x_range, [found.u, [-half, half]])
-        _span(at.phase.y_range, [found.v])
-        _span(at.course.y_range, [found.u, [-half, half]])
-        _decades(at.energy.y_range, energies[energies > 0])
+        figures = self.figures
+        figures.course.x_range.update(start=0.0, end=motion.span)
+        _span(figures.phase.x_range, [motion.u, [-half, half]])
+        _span(figures.phase.y_range, [motion.v])
+        _span(figures.course.y_range, [motion.u, [-half, half]])
+        _decades(figures.energy.y_range, energies[energies > 0])
 
-    def line(self, found: CellLine) -> None:
-        """Draw the line through the cell."""
-        of = self.tables
-        of.rising.data = dict(zip("xy", found.rising, strict=True))
-        of.falling.data = dict(zip("xy", found.falling, strict=True))
-        _span(self.figures.line.y_range, [found.rising[1], found.falling[1]])
+    def line(self, line: CellLine) -> None:
+        """Draw the orbit diagram along the line through the cell."""
+        tables = self.tables
+        tables.rising.data = dict(zip("xy", line.rising, strict=True))
+        tables.falling.data = dict(zip("xy", line.falling, strict=True))
+        _span(self.figures.line.y_range, [line.rising[1], line.falling[1]])
 
     def visited(self, points: list[tuple[float, float]]) -> None:
-        """Draw the impacts of the picks that were dragged along."""
+        """Draw points (axis value, impact velocity): the impacts of the cells that a dragged pick has passed."""
         self.tables.visited.data = _points(points)
 
-    def basin(self, found: CellBasin | None) -> list[str]:
-        """Draw basins, and give the colours of the attractors."""
-        if found is None:
+    def basin(self, basin: CellBasin | None) -> list[str]:
+        """Draw the basins of a cell and return the colours of its attractors; for None, clear the figure."""
+        if basin is None:
             self.tables.basin.data = {name: [] for name in ("image", "x", "y", "dw", "dh")}
             return []
-        colours = attractor_colours(found.labels)
-        shades = np.array([[*bytes.fromhex(colour[1:]), 255] for colour in colours], np.uint8)
-        image = shades[found.place].view(np.uint32)[..., 0]
-        across, up = (float(axis[-1] - axis[0]) for axis in (found.u0, found.v0))
-        self.figures.basin.x_range.update(start=float(found.u0[0]), end=float(found.u0[-1]))
-        self.figures.basin.y_range.update(start=float(found.v0[0]), end=float(found.v0[-1]))
-        corner = {"x": [float(found.u0[0])], "y": [float(found.v0[0])], "dw": [across], "dh": [up]}
+        colours = attractor_colours(basin.labels)
+        colour_bytes = np.array([[*bytes.fromhex(colour[1:]), 255] for colour in colours], np.uint8)
+        # Bokeh expects each pixel as one 32-bit number: red, green, blue and opacity, a byte each.
+        image = colour_bytes[basin.place].view(np.uint32)[..., 0]
+        across, up = (float(axis[-1] - axis[0]) for axis in (basin.u0, basin.v0))
+        self.figures.basin.x_range.update(start=float(basin.u0[0]), end=float(basin.u0[-1]))
+        self.figures.basin.y_range.update(start=float(basin.v0[0]), end=float(basin.v0[-1]))
+        corner = {"x": [float(basin.u0[0])], "y": [float(basin.v0[0])], "dw": [across], "dh": [up]}
         self.tables.basin.data = {"image": [image], **corner}
         return colours
 
-    def branch(self, found: CellBranch | None) -> None:
-        """Draw branches: stable thick and black, unstable thin and red, with what they met."""
-        of = self.tables
-        rows: dict[float, dict[str, list[Any]]] = {kept: {"xs": [], "ys": []} for kept in (0.0, 1.0)}
-        for values, speeds, stable in () if found is None else found.lines:
-            for kept, row in rows.items():
-                # A segment belongs to the point it leads to, so that the two colours join.
-                own = (stable == kept) | np.append(stable[1:] == kept, False)
-                row["xs"].append(np.where(own, values, np.nan))
-                row["ys"].append(np.where(own, speeds, np.nan))
-        of.unstable.data, of.stable.data = rows[0.0], rows[1.0]
-        if found is not None:
-            _span(self.figures.branch.y_range, [speeds for _, speeds, _ in found.lines])
-        met = () if found is None else found.met
-        kinds, x, y = zip(*met, strict=True) if met else ((), (), ())
-        of.met.data = {"x": list(x), "y": list(y), "kind": list(kinds)}
+    def branch(self, branch: CellBranch | None) -> None:
+        """Draw branches and events, stable parts thick and black, unstable ones thin and red; for None, clear them."""
+        tables = self.tables
+        rows: dict[float, dict[str, list[Any]]] = {stability: {"xs": [], "ys": []} for stability in (0.0, 1.0)}
+        for values, speeds, stable in () if branch is None else branch.lines:
+            for stability, row in rows.items():
+                # A segment has the colour of its last point, so that the lines of both colours meet without a gap.
+                selected = (stable == stability) | np.append(stable[1:] == stability, False)
+                row["xs"].append(np.where(selected, values, np.nan))
+                row["ys"].append(np.where(selected, speeds, np.nan))
+        tables.unstable.data, tables.stable.data = rows[0.0], rows[1.0]
+        if branch is not None:
+            _span(self.figures.branch.y_range, [speeds for _, speeds, _ in branch.lines])
+        events = () if branch is None else branch.events
+        kinds, x, y = zip(*events, strict=True) if events else ((), (), ())
+        tables.events.data = {"x": list(x), "y": list(y), "kind": list(kinds)}
 
     def optima(self, places: list[tuple[float, float]]) -> None:
-        """Mark optima on the map."""
+        """Mark optima on the map at the points (x, y)."""
         self.tables.optima.data = _points(places)
 
 
-_STRONG, _WEAK = 1.8, 1.2  # pixels that curves are wide
+_STRONG, _WEAK = 1.8, 1.2  # widths in pixels of curves that stable and that only unstable orbits border
 _MICRO = 1e6  # energies are drawn in microjoules
 
 
-def _span(where: Any, values: list[Any]) -> None:
-    """Put a range around values, with a margin."""
-    every = np.concatenate([np.ravel(one) for one in values])
-    every = every[np.isfinite(every)]
-    if every.size:
-        low, high = float(every.min()), float(every.max())
+def _span(axis_range: Any, values: list[Any]) -> None:
+    """Set a range of a figure to the finite values, with a margin of 7 % of their span at each end."""
+    flat = np.concatenate([np.ravel(part) for part in values])
+    flat = flat[np.isfinite(flat)]
+    if flat.size:
+        low, high = float(flat.min()), float(flat.max())
         margin = 0.07 * (high - low) or 0.1 * max(abs(high), 1e-3)
-        where.update(start=low - margin, end=high + margin)
+        axis_range.update(start=low - margin, end=high + margin)
 
 
-def _decades(where: Any, values: np.ndarray) -> None:
-    """Put a logarithmic range around values, with a margin of half its size or more."""
+def _decades(axis_range: Any, values: np.ndarray) -> None:
+    """Set a logarithmic range to the values; each margin is 1/5 of their logarithmic span, at least a factor of 1.6."""
     if values.size:
         margin = max((float(values.max()) / float(values.min())) ** 0.2, 1.6)
-        where.update(start=float(values.min()) / margin, end=float(values.max()) * margin)
+        axis_range.update(start=float(values.min()) / margin, end=float(values.max()) * margin)
 
 
 def _points(places: list[tuple[float, float]]) -> dict[str, list[Any]]:
@@ -165,20 +177,23 @@ def _points(places: list[tuple[float, float]]) -> dict[str, list[Any]]:
 
 
 def _places(axis: Axis) -> np.ndarray:
-    """Find which cell each pixel along an axis shows: pixels are evenly spaced on its scale, cells need not be."""
+    """Return the index of the cell that each pixel shows along an axis.
+
+    Pixels are evenly spaced on the scale of the axis; cells may be unevenly spaced, or more than `MOST_PIXELS`.
+    """
     count = axis.values.size
     if axis.even and count <= MOST_PIXELS:
         return np.arange(count)
     low, high = axis.edges[0], axis.edges[-1]
     pixels = min(MOST_PIXELS, 8 * count)
-    parts = (np.arange(pixels) + 0.5) / pixels
-    where = low * (high / low) ** parts if axis.scale == "log" else low + (high - low) * parts
-    return np.clip(np.searchsorted(axis.edges, where) - 1, 0, count - 1)
+    fractions = (np.arange(pixels) + 0.5) / pixels
+    positions = low * (high / low) ** fractions if axis.scale == "log" else low + (high - low) * fractions
+    return np.clip(np.searchsorted(axis.edges, positions) - 1, 0, count - 1)
 
 
 def _pixels(plane: ExploredPlane, colours: np.ndarray) -> np.ndarray:
-    shown = np.ascontiguousarray(colours[np.ix_(_places(plane.y), _places(plane.x))])
-    return shown.view(np.uint32)[..., 0]
+    sampled = np.ascontiguousarray(colours[np.ix_(_places(plane.y), _places(plane.x))])
+    return sampled.view(np.uint32)[..., 0]
 
 
 def _image(pixels: np.ndarray, x: Axis, y: Axis) -> dict[str, list[Any]]:
@@ -188,15 +203,16 @@ def _image(pixels: np.ndarray, x: Axis, y: Axis) -> dict[str, list[Any]]:
 
 
 def _veil(plane: ExploredPlane, veiled: np.ndarray) -> dict[str, np.ndarray]:
-    """Cover runs of veiled cells by rectangles, equal ones of neighbouring rows by one."""
+    """Return rectangles that cover the veiled cells; equal runs of columns in successive rows share one rectangle."""
+    # First row of every rectangle that may still grow, by (first column, column after the last).
     open_runs: dict[tuple[int, int], int] = {}
-    found = []
+    rectangles = []
     for row in range(veiled.shape[0] + 1):
-        now = {(int(a), int(b)) for a, b in runs(veiled[row])} if row < veiled.shape[0] else set()
-        ended = [run for run in open_runs if run not in now]
-        found += [(*run, open_runs.pop(run), row) for run in ended]
-        for run in now:
+        current = {(int(a), int(b)) for a, b in runs(veiled[row])} if row < veiled.shape[0] else set()
+        ended = [run for run in open_runs if run not in current]
+        rectangles += [(*run, open_runs.pop(run), row) for run in ended]
+        for run in current:
             open_runs.setdefault(run, row)
-    table = np.array(found, int).reshape(-1, 4)
+    table = np.array(rectangles, int).reshape(-1, 4)
     x, y = plane.x.edges, plane.y.edges
     return {"left": x[table[:, 0]], "right": x[table[:, 1]], "bottom": y[table[:, 2]], "top": y[table[:, 3]]}

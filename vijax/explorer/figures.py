@@ -1,4 +1,4 @@
-"""The figures of a page, empty at first, and the tables of numbers that they draw."""
+"""Figures of a page, empty at first, and the tables of numbers that they draw."""
 
 import math
 from dataclasses import dataclass, fields
@@ -23,16 +23,16 @@ from bokeh.models.annotations import ColorBar, Span
 from bokeh.plotting import figure
 
 from vijax.explorer.plane import Axis, ExploredPlane
-from vijax.explorer.theme import AXIS, COLOURS, written
+from vijax.explorer.theme import AXIS, COLOURS, axis_text
 from vijax.plots.curve_lines import screen_style
 
-_LEFT = 66  # pixels left of figures that share their axis of time
+_LEFT_BORDER = 66  # equal left border in pixels of figures that share a time axis, so that their times align
 _EMPTY: dict[str, list[Any]] = {"x": [], "y": []}
 
 
 @dataclass(frozen=True)
 class PageFigures:
-    """The figures by the names that the page places them by."""
+    """The figures of a page; the name of a field is the figure's name in the template of the page."""
 
     map: Plot
     phase: Plot
@@ -43,13 +43,13 @@ class PageFigures:
     branch: Plot
 
     def all(self) -> dict[str, Plot]:
-        """Give every figure by its name."""
-        return {one.name: getattr(self, one.name) for one in fields(self)}
+        """Return every figure by its name."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
 
 
 @dataclass(frozen=True)
 class PageTables:
-    """What figures draw: tables of columns, by what they hold."""
+    """The tables (Bokeh data sources) that the figures draw; a field has the name of its table."""
 
     cells: ColumnDataSource
     veil: ColumnDataSource
@@ -65,19 +65,19 @@ class PageTables:
     membranes: ColumnDataSource
     impacts: ColumnDataSource
     harvested: ColumnDataSource
-    refused: ColumnDataSource
-    given: ColumnDataSource
+    inadmissible: ColumnDataSource
+    transferred: ColumnDataSource
     rising: ColumnDataSource
     falling: ColumnDataSource
     visited: ColumnDataSource
     basin: ColumnDataSource
     stable: ColumnDataSource
     unstable: ColumnDataSource
-    met: ColumnDataSource
+    events: ColumnDataSource
 
 
 def tables() -> PageTables:
-    """Make all tables, empty."""
+    """Return all tables, empty."""
     columns: dict[str, tuple[str, ...]] = {
         "cells": ("image", "x", "y", "dw", "dh"),
         "veil": ("left", "right", "bottom", "top"),
@@ -90,19 +90,19 @@ def tables() -> PageTables:
         "impacts": ("t", "x", "v"),
         "stable": ("xs", "ys"),
         "unstable": ("xs", "ys"),
-        "met": ("x", "y", "kind"),
+        "events": ("x", "y", "kind"),
     }
     return PageTables(
         **{
-            one.name: ColumnDataSource({name: [] for name in columns.get(one.name, tuple(_EMPTY))}, name=one.name)
-            for one in fields(PageTables)
+            item.name: ColumnDataSource({name: [] for name in columns.get(item.name, tuple(_EMPTY))}, name=item.name)
+            for item in fields(PageTables)
         }
     )
 
 
 @dataclass(frozen=True)
 class Walls:
-    """Lines that stand at the walls and at the pick, moved as the cell changes."""
+    """The movable lines of the figures: at the walls (u = -d/2 and d/2), and at the axis values of the picked cell."""
 
     phase: tuple[Span, Span]
     course: tuple[Span, Span]
@@ -112,9 +112,9 @@ class Walls:
     up: Span
 
 
-def _bare(name: str, **further: Any) -> Any:
-    """Make an empty figure in the style of the page."""
-    made = figure(
+def _empty_figure(name: str, **further: Any) -> Any:
+    """Return an empty figure in the style of the page."""
+    plot = figure(
         name=name,
         sizing_mode="stretch_both",
         min_width=260,
@@ -123,10 +123,10 @@ def _bare(name: str, **further: Any) -> Any:
         output_backend="canvas",
         **further,
     )
-    made.outline_line_color = AXIS["line"]
-    made.background_fill_color = made.border_fill_color = "white"  # a clear one keeps the ticks of earlier ranges
-    made.min_border_right = 14
-    for axis in (*made.xaxis, *made.yaxis):
+    plot.outline_line_color = AXIS["line"]
+    plot.background_fill_color = plot.border_fill_color = "white"  # if transparent, earlier ticks stay visible
+    plot.min_border_right = 14
+    for axis in (*plot.xaxis, *plot.yaxis):
         axis.axis_label_text_font_style = "normal"
         axis.axis_label_text_font_size = "13px"
         axis.major_label_text_font_size = "12px"
@@ -134,31 +134,33 @@ def _bare(name: str, **further: Any) -> Any:
         axis.axis_line_color = axis.major_tick_line_color = AXIS["line"]
         axis.minor_tick_line_color = None
         axis.axis_label_standoff = 4
-    made.grid.grid_line_color = None
-    return made
+    plot.grid.grid_line_color = None
+    return plot
 
 
-def _line(where: Any, dimension: Any, colour: str, width: float = 1.0, **style: Any) -> Span:
+def _line(plot: Any, dimension: Any, colour: str, width: float = 1.0, **style: Any) -> Span:
     span = Span(location=0, dimension=dimension, line_color=colour, line_width=width, level="underlay", **style)
-    where.add_layout(span)
+    plot.add_layout(span)
     return span
 
 
-def figures(plane: ExploredPlane, of: PageTables, kinds: tuple[str, ...] = ()) -> tuple[PageFigures, Walls, ColorBar]:
-    """Make the figures of a page, with the lines in them that move; `kinds` are those of the curves over its map."""
-    shown_map, bar = _map(plane, of, kinds)
+def figures(
+    plane: ExploredPlane, tables: PageTables, kinds: tuple[str, ...] = ()
+) -> tuple[PageFigures, Walls, ColorBar]:
+    """Return the figures of a page, their movable lines and the colour bar; `kinds` are the kinds of its curves."""
+    map_plot, bar = _map(plane, tables, kinds)
     across = Span(dimension="height", line_color="white", line_dash="dotted", level="overlay")
     up = Span(dimension="width", line_color="white", line_dash="dotted", level="overlay")
-    shown_map.add_layout(across)
-    shown_map.add_layout(up)
-    # What moves with the pick is on the layer above: the map below is not painted again.
+    map_plot.add_layout(across)
+    map_plot.add_layout(up)
+    # The marks of the picked cell are on Bokeh's overlay layer, so that moving them does not redraw the map.
     for colour, width in (("black", 4), ("white", 2)):
         ring = {"fill_color": None, "line_color": colour, "line_width": width, "level": "overlay"}
-        shown_map.scatter("x", "y", source=of.pick, size=13, **ring)
-    phase, course, energy = _phase(of), _course(of), _energy(of)
+        map_plot.scatter("x", "y", source=tables.pick, size=13, **ring)
+    phase, course, energy = _phase(tables), _course(tables), _energy(tables)
     energy.x_range = course.x_range
-    branch, basin = _branch(of), _basin(of)
-    line = _diagram(of)
+    branch, basin = _branch(tables), _basin(tables)
+    line = _diagram(tables)
     walls = Walls(
         phase=(_line(phase, "height", COLOURS["wall"]), _line(phase, "height", COLOURS["wall"])),
         course=(_line(course, "width", COLOURS["wall"]), _line(course, "width", COLOURS["wall"])),
@@ -167,51 +169,51 @@ def figures(plane: ExploredPlane, of: PageTables, kinds: tuple[str, ...] = ()) -
         across=across,
         up=up,
     )
-    return PageFigures(shown_map, phase, course, energy, line, basin, branch), walls, bar
+    return PageFigures(map_plot, phase, course, energy, line, basin, branch), walls, bar
 
 
-def scale(where: Any, axis: Axis, side: str = "below") -> None:
-    """Put an axis of a figure on that of the map: its scale, ticks and words."""
-    own = getattr(where, side)[0]
+def scale(plot: Any, axis: Axis, side: str = "below") -> None:
+    """Set the scale, ticks and label of one side of a figure so that it shows an axis of the map."""
+    plot_axis = getattr(plot, side)[0]
     log = axis.scale == "log"
-    setattr(where, "x_scale" if side == "below" else "y_scale", LogScale() if log else LinearScale())
+    setattr(plot, "x_scale" if side == "below" else "y_scale", LogScale() if log else LinearScale())
     ticks = _ticks(float(axis.edges[0]), float(axis.edges[-1])) if log else []
-    own.ticker = FixedTicker(ticks=ticks) if ticks else BasicTicker(desired_num_ticks=5)
-    own.formatter = BasicTickFormatter()
-    own.axis_label = written(axis.name)
+    plot_axis.ticker = FixedTicker(ticks=ticks) if ticks else BasicTicker(desired_num_ticks=5)
+    plot_axis.formatter = BasicTickFormatter()
+    plot_axis.axis_label = axis_text(axis.name)
 
 
-_FEW = 3.5  # decades up to which 1, 2 and 5 of each are written
+_FEW_DECADES = 3.5  # an axis of at most this many decades has ticks at 1, 2 and 5 times each power of ten
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Give 1, 2 and 5 of every decade of a logarithmic axis, or its powers of ten where these are many."""
+    """Return ticks of a logarithmic axis: 1, 2, 5 times powers of ten or, over `_FEW_DECADES`, powers of ten only."""
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
-    parts = (1, 2, 5) if math.log10(high / low) <= _FEW else (1,)
-    found = [part * 10.0**power for power in range(first, last + 1) for part in parts]
-    return [one for one in found if low <= one <= high]
+    multiples = (1, 2, 5) if math.log10(high / low) <= _FEW_DECADES else (1,)
+    ticks = [multiple * 10.0**power for power in range(first, last + 1) for multiple in multiples]
+    return [tick for tick in ticks if low <= tick <= high]
 
 
-def ranged(axis: Axis) -> dict[str, Any]:
-    """Give the range of an axis."""
+def range_limits(axis: Axis) -> dict[str, Any]:
+    """Return the limits of an axis as arguments of a Bokeh range."""
     return {"start": float(axis.edges[0]), "end": float(axis.edges[-1])}
 
 
-def _map(plane: ExploredPlane, of: PageTables, kinds: tuple[str, ...]) -> tuple[Any, ColorBar]:
-    made = _bare(
+def _map(plane: ExploredPlane, tables: PageTables, kinds: tuple[str, ...]) -> tuple[Any, ColorBar]:
+    plot = _empty_figure(
         "map",
-        x_range=Range1d(**ranged(plane.x)),
-        y_range=Range1d(**ranged(plane.y)),
+        x_range=Range1d(**range_limits(plane.x)),
+        y_range=Range1d(**range_limits(plane.y)),
     )
-    scale(made, plane.x)
-    scale(made, plane.y, "left")
-    made.image_rgba("image", "x", "y", "dw", "dh", source=of.cells)
-    made.quad(
+    scale(plot, plane.x)
+    scale(plot, plane.y, "left")
+    plot.image_rgba("image", "x", "y", "dw", "dh", source=tables.cells)
+    plot.quad(
         "left",
         "right",
         "top",
         "bottom",
-        source=of.veil,
+        source=tables.veil,
         fill_color="white",
         fill_alpha=0.5,
         line_color=None,
@@ -221,13 +223,15 @@ def _map(plane: ExploredPlane, of: PageTables, kinds: tuple[str, ...]) -> tuple[
         hatch_weight=0.7,
     )
     for colour, width in (("black", 2.4), ("white", 1.2)):
-        made.segment("x0", "y0", "x1", "y1", source=of.border, line_color=colour, line_width=width, line_cap="square")
-    made.scatter("x", "y", source=of.dots, size=2, color="black")
-    made.scatter("x", "y", source=of.crosses, marker="x", size=5, color="red")
+        plot.segment(
+            "x0", "y0", "x1", "y1", source=tables.border, line_color=colour, line_width=width, line_cap="square"
+        )
+    plot.scatter("x", "y", source=tables.dots, size=2, color="black")
+    plot.scatter("x", "y", source=tables.crosses, marker="x", size=5, color="red")
     if kinds:
-        _curves(made, of, kinds)
-    made.scatter("x", "y", source=of.star, marker="star", size=15, fill_color="#d62728", line_color="white")
-    made.scatter("x", "y", source=of.optima, marker="diamond", size=13, fill_color="#ff7f0e", line_color="white")
+        _curves(plot, tables, kinds)
+    plot.scatter("x", "y", source=tables.star, marker="star", size=15, fill_color="#d62728", line_color="white")
+    plot.scatter("x", "y", source=tables.optima, marker="diamond", size=13, fill_color="#ff7f0e", line_color="white")
     bar = ColorBar(
         color_mapper=LinearColorMapper(palette="Viridis256", low=0, high=1),
         width=12,
@@ -236,116 +240,118 @@ def _map(plane: ExploredPlane, of: PageTables, kinds: tuple[str, ...]) -> tuple[
         major_label_text_color=AXIS["text"],
         background_fill_color=None,
     )
-    made.add_layout(bar, "right")
-    return made, bar
+    plot.add_layout(bar, "right")
+    return plot, bar
 
 
-def _curves(made: Any, of: PageTables, kinds: tuple[str, ...]) -> None:
-    """Draw curves of bifurcations, a kind at a time, as dashes are of a kind; who points at one is told what it is."""
-    made.multi_line("xs", "ys", source=of.curves, line_color="white", line_width=3.6, line_alpha="edge")
+def _curves(plot: Any, tables: PageTables, kinds: tuple[str, ...]) -> None:
+    """Draw bifurcation curves with a tooltip, by one line glyph per kind, because a glyph has one dash pattern."""
+    plot.multi_line("xs", "ys", source=tables.curves, line_color="white", line_width=3.6, line_alpha="edge")
     lines = []
     for kind in kinds:
         colour, dashes = screen_style(kind)
         style = {"line_color": colour, "line_width": "width", "line_alpha": "alpha"}
         view = CDSView(filter=GroupFilter(column_name="kind", group=kind))
         dash = " ".join(str(round(_DASH * part)) for part in dashes) or "solid"
-        lines.append(made.multi_line("xs", "ys", source=of.curves, view=view, line_dash=dash, **style))
-    made.scatter("x", "y", source=of.points, size=6, fill_color="white", line_color="black")
-    # The edge of letters is drawn over them, so that they are drawn once more.
+        lines.append(plot.multi_line("xs", "ys", source=tables.curves, view=view, line_dash=dash, **style))
+    plot.scatter("x", "y", source=tables.points, size=6, fill_color="white", line_color="black")
+    # Bokeh draws the outline of letters over their filling, so the letters are drawn again without outline on top.
     words = {"text_font_size": "12px", "x_offset": 5, "y_offset": -3}
     for edge in (
         {"text_color": "white", "text_outline_color": "white", "text_outline_width": 3},
         {"text_color": "black"},
     ):
-        made.text("x", "y", "number", source=of.points, **words, **edge)
-    made.add_tools(HoverTool(renderers=lines, tooltips=[("", "@kind of @label")], description="Curves"))
+        plot.text("x", "y", "number", source=tables.points, **words, **edge)
+    plot.add_tools(HoverTool(renderers=lines, tooltips=[("", "@kind of @label")], description="Curves"))
 
 
-_DASH = 1.8  # pixels that a curve is wide
+_DASH = 1.8  # width of a curve in pixels; dash lengths are multiples of this width
 
 
 def mapper(span: tuple[float, float], log: bool, palette: tuple[str, ...]) -> Any:
-    """Make what a bar of colours reads."""
+    """Return the Bokeh colour mapper of a colour bar from the lowest to the highest value, `span`."""
     kind = LogColorMapper if log else LinearColorMapper
     return kind(palette=list(palette), low=span[0], high=span[1])
 
 
-def _phase(of: PageTables) -> Any:
-    made = _bare(
+def _phase(tables: PageTables) -> Any:
+    plot = _empty_figure(
         "phase", x_range=Range1d(), y_range=Range1d(), x_axis_label="displacement u", y_axis_label="velocity u\u0307"
     )
-    made.line("x", "v", source=of.course, line_color="black", line_width=1.2)
-    made.scatter("x", "v", source=of.impacts, size=7, color=COLOURS["impact"])
-    return made
+    plot.line("x", "v", source=tables.course, line_color="black", line_width=1.2)
+    plot.scatter("x", "v", source=tables.impacts, size=7, color=COLOURS["impact"])
+    return plot
 
 
-def _course(of: PageTables) -> Any:
-    made = _bare(
+def _course(tables: PageTables) -> Any:
+    plot = _empty_figure(
         "course",
         y_axis_label="displacement u",
         x_range=Range1d(start=0, end=2),
         y_range=Range1d(),
-        min_border_left=_LEFT,
+        min_border_left=_LEFT_BORDER,
     )
-    made.line("t", "x", source=of.course, line_color="black", line_width=1.2)
+    plot.line("t", "x", source=tables.course, line_color="black", line_width=1.2)
     for side in ("left", "right"):
-        made.line("t", side, source=of.membranes, line_color=COLOURS["membrane"], line_width=2.5, line_alpha=0.8)
-    made.scatter("t", "x", source=of.impacts, size=6, color=COLOURS["impact"])
-    return made
+        plot.line("t", side, source=tables.membranes, line_color=COLOURS["membrane"], line_width=2.5, line_alpha=0.8)
+    plot.scatter("t", "x", source=tables.impacts, size=6, color=COLOURS["impact"])
+    return plot
 
 
-def _energy(of: PageTables) -> Any:
-    made = _bare(
+def _energy(tables: PageTables) -> Any:
+    plot = _empty_figure(
         "energy",
         x_axis_label="t [half forcing periods]",
         y_axis_label="E [\u00b5J]",
         y_axis_type="log",
         y_range=Range1d(start=1, end=100),
-        min_border_left=_LEFT,
+        min_border_left=_LEFT_BORDER,
     )
-    made.left[0].ticker = FixedTicker(ticks=_ticks(1e-6, 1e9))
-    made.left[0].formatter = BasicTickFormatter()
-    made.scatter("x", "y", source=of.given, size=9, fill_color=None, line_color=COLOURS["given"], line_width=1.8)
-    made.scatter("x", "y", source=of.harvested, size=7, color=COLOURS["harvested"])
-    made.scatter("x", "y", source=of.refused, marker="x", size=11, color=COLOURS["refused"], line_width=2)
-    return made
+    plot.left[0].ticker = FixedTicker(ticks=_ticks(1e-6, 1e9))
+    plot.left[0].formatter = BasicTickFormatter()
+    plot.scatter(
+        "x", "y", source=tables.transferred, size=9, fill_color=None, line_color=COLOURS["transferred"], line_width=1.8
+    )
+    plot.scatter("x", "y", source=tables.harvested, size=7, color=COLOURS["harvested"])
+    plot.scatter("x", "y", source=tables.inadmissible, marker="x", size=11, color=COLOURS["inadmissible"], line_width=2)
+    return plot
 
 
-def _diagram(of: PageTables) -> Any:
-    made = _bare("line", y_axis_label="impact velocity", x_range=Range1d(), y_range=Range1d())
-    made.scatter("x", "y", source=of.falling, size=4, color=COLOURS["falling"])
-    made.scatter("x", "y", source=of.rising, size=2.6, color=COLOURS["rising"])
-    made.scatter(
+def _diagram(tables: PageTables) -> Any:
+    plot = _empty_figure("line", y_axis_label="impact velocity", x_range=Range1d(), y_range=Range1d())
+    plot.scatter("x", "y", source=tables.falling, size=4, color=COLOURS["falling"])
+    plot.scatter("x", "y", source=tables.rising, size=2.6, color=COLOURS["rising"])
+    plot.scatter(
         "x",
         "y",
-        source=of.visited,
+        source=tables.visited,
         marker="circle",
         size=8,
         fill_color=None,
         line_color=COLOURS["pick"],
         line_width=1.8,
     )
-    return made
+    return plot
 
 
-def _basin(of: PageTables) -> Any:
-    made = _bare("basin", x_range=Range1d(), y_range=Range1d(), x_axis_label="u\u2080", y_axis_label="v\u2080")
-    made.image_rgba("image", "x", "y", "dw", "dh", source=of.basin)
-    return made
+def _basin(tables: PageTables) -> Any:
+    plot = _empty_figure("basin", x_range=Range1d(), y_range=Range1d(), x_axis_label="u\u2080", y_axis_label="v\u2080")
+    plot.image_rgba("image", "x", "y", "dw", "dh", source=tables.basin)
+    return plot
 
 
-def _branch(of: PageTables) -> Any:
-    made = _bare("branch", y_axis_label="impact velocity", x_range=Range1d(), y_range=Range1d())
-    made.multi_line("xs", "ys", source=of.unstable, line_color=COLOURS["unstable"], line_width=1.1)
-    made.multi_line("xs", "ys", source=of.stable, line_color="black", line_width=2)
-    made.scatter(
+def _branch(tables: PageTables) -> Any:
+    plot = _empty_figure("branch", y_axis_label="impact velocity", x_range=Range1d(), y_range=Range1d())
+    plot.multi_line("xs", "ys", source=tables.unstable, line_color=COLOURS["unstable"], line_width=1.1)
+    plot.multi_line("xs", "ys", source=tables.stable, line_color="black", line_width=2)
+    plot.scatter(
         "x",
         "y",
-        source=of.met,
+        source=tables.events,
         size=8,
         marker="circle",
         fill_color="white",
         line_color=COLOURS["rising"],
         line_width=1.6,
     )
-    return made
+    return plot

@@ -1,4 +1,4 @@
-// What the page does by itself: it asks the server by messages and writes what it is told, always as text.
+// Script of the page: it sends requests to the server and displays the server's messages, always as text.
 window.vijax = (() => {
   let channel, pick, across, up, figure, axes, number = 0, sent = 0, state = {}, base = {};
   const id = (name) => document.getElementById(name);
@@ -9,8 +9,8 @@ window.vijax = (() => {
     if (classes) made.className = classes;
     return made;
   };
-  // Equal messages in a row would be no change to the server, so each is numbered.
-  const ask = (kind, content = {}) => { channel.asked = { kind, sent: ++sent, ...content }; };
+  // The server does not notice a message that equals the last one, so messages are numbered.
+  const send = (kind, content = {}) => { channel.request = { kind, sent: ++sent, ...content }; };
   const hide = (element, hidden) => { element.hidden = hidden; };
 
   // --- the pick ------------------------------------------------------------------------------------------------
@@ -24,18 +24,18 @@ window.vijax = (() => {
     return low;
   };
   const choose = (column, row) => {
-    const most = [axes.x.values.length - 1, axes.y.values.length - 1];
-    column = Math.min(Math.max(column, 0), most[0]);
-    row = Math.min(Math.max(row, 0), most[1]);
+    const last = [axes.x.values.length - 1, axes.y.values.length - 1];
+    column = Math.min(Math.max(column, 0), last[0]);
+    row = Math.min(Math.max(row, 0), last[1]);
     if (state.pick && state.pick[0] === column && state.pick[1] === row) return;
     state.pick = [column, row];
     const x = axes.x.values[column], y = axes.y.values[row];
     pick.data = { x: [x], y: [y] };
     across.location = x;
     up.location = y;
-    ask("pick", { column, row, number: ++number });
+    send("pick", { column, row, number: ++number });
   };
-  // By the pointer's own events: Bokeh waits 300 ms after a tap for a second one, and then tells of one double tap.
+  // Events of the pointer: Bokeh waits 300 ms after a tap for a second one, and then reports one double tap.
   const pointed = (event) => {
     if (!axes || (event.type === "pointermove" && !(event.buttons & 1)) || event.button > 0) return;
     const { frame } = Bokeh.index.find_one(figure), box = id("map").getBoundingClientRect(), { bbox } = frame;
@@ -55,11 +55,11 @@ window.vijax = (() => {
     choose(state.pick[0] + far * step[0], state.pick[1] + far * step[1]);
   };
 
-  // --- what is told --------------------------------------------------------------------------------------------
+  // --- messages of the server -----------------------------------------------------------------------------------
   const options = (select, names) => select.replaceChildren(...names.map((name) => {
-    const one = make("option", name.replaceAll("_", " "));
-    one.value = name;
-    return one;
+    const option = make("option", name.replaceAll("_", " "));
+    option.value = name;
+    return option;
   }));
   const slider = ({ name, label, low, high, value }) => {
     const row = make("div", undefined, "value");
@@ -71,23 +71,23 @@ window.vijax = (() => {
     title.htmlFor = range.id;
     range.addEventListener("input", () => {
       exact.value = +(+range.value).toPrecision(6);
-      ask("value", { name, value: +exact.value, number: ++number });
+      send("value", { name, value: +exact.value, number: ++number });
     });
     exact.addEventListener("change", () => {
       const value = Number.isFinite(exact.valueAsNumber) ? exact.valueAsNumber : exact.value;
-      ask("value", { name, value, number: ++number });
+      send("value", { name, value, number: ++number });
     });
     row.append(title, range, exact);
     base[name] = value;
     return row;
   };
-  // When all of an answer is on the screen: what benchmarks and tests wait for.
+  // Marks that an answer is completely on the screen; benchmarks and tests wait for the mark.
   const answered = (request) => {
     requestAnimationFrame(() => requestAnimationFrame(() => { document.body.dataset.shown = request; }));
   };
   const table = (rows) => {
     const made = make("table"), head = make("tr"), body = make("tbody");
-    rows[0].forEach((text) => { const one = make("th", text); one.scope = "col"; head.append(one); });
+    rows[0].forEach((text) => { const heading = make("th", text); heading.scope = "col"; head.append(heading); });
     if (rows[0][0] === "") head.firstChild.append(make("span", "colour", "unseen"));
     rows.slice(1).forEach((row) => {
       const line = make("tr");
@@ -108,31 +108,31 @@ window.vijax = (() => {
     return made;
   };
   const sections = {
-    page({ title, variables, axes: told, sliders }) {
-      axes = told;
+    page({ title, variables, axes: mapAxes, sliders }) {
+      axes = mapAxes;
       id("title").textContent = title;
       document.title = `vijax ${title}`;
       options(id("variable"), variables);
       options(id("along"), [axes.x.name, axes.y.name]);
       id("values").replaceChildren(...sliders.map(slider));
     },
-    view(told) {
-      state = told;
-      id("variable").value = told.variable;
-      id("scale").value = told.scale;
-      id("curves").value = told.curves;
-      id("along").value = told.along;
-      id("follow").checked = told.follow;
+    view(content) {
+      state = content;
+      id("variable").value = content.variable;
+      id("scale").value = content.scale;
+      id("curves").value = content.curves;
+      id("along").value = content.along;
+      id("follow").checked = content.follow;
       all(".value").forEach((row) => {
-        const { name } = row.dataset, moved = name in told.values, value = moved ? told.values[name] : base[name];
+        const { name } = row.dataset, moved = name in content.values, value = moved ? content.values[name] : base[name];
         const [, range, exact] = row.children;
         row.classList.toggle("moved", moved);
         if (document.activeElement !== range) range.value = value;
         if (document.activeElement !== exact) exact.value = +(+value).toPrecision(6);
       });
-      id("make").disabled = told.moved.length === 0;
+      id("make").disabled = content.moved.length === 0;
       const token = new URLSearchParams(location.search).get("token");
-      const query = new URLSearchParams(told.query);
+      const query = new URLSearchParams(content.query);
       if (token) query.set("token", token);
       history.replaceState(null, "", `?${query}`);
     },
@@ -197,7 +197,7 @@ window.vijax = (() => {
       if (name === "plane" && now === "running") {
         const stop = make("button", "Cancel");
         stop.type = "button";
-        stop.addEventListener("click", () => ask("cancel", { name }));
+        stop.addEventListener("click", () => send("cancel", { name }));
         place.append(stop);
       }
     },
@@ -223,11 +223,11 @@ window.vijax = (() => {
       hide(id("note"), !text);
       if (error) answered(number);
     },
-    warmth({ text }) {
-      id("warmth").textContent = text;
-      hide(id("warmth"), !text);
+    compilation({ text }) {
+      id("compilation").textContent = text;
+      hide(id("compilation"), !text);
     },
-    ask({ text }) { if (confirm(text)) ask("make", { sure: true }); },
+    confirm({ text }) { if (window.confirm(text)) send("make", { confirmed: true }); },
     file({ name, content }) {
       const link = make("a");
       link.href = `data:application/octet-stream;base64,${content}`;
@@ -235,21 +235,21 @@ window.vijax = (() => {
       link.click();
     },
   };
-  const told = (message) => sections[message.section]?.(message);
+  const receive = (message) => sections[message.section]?.(message);
   const copied = async (text, button) => {
     await navigator.clipboard.writeText(text);
     const before = button.textContent;
     button.textContent = "Copied";
     setTimeout(() => { button.textContent = before; }, 1500);
   };
-  const files = (name, there) => {
-    const place = document.querySelector(`.files[data-what="${name}"]`);
+  const files = (name, shown) => {
+    const place = document.querySelector(`.files[data-export="${name}"]`);
     if (!place) return;
-    place.replaceChildren(...(there ? ["pdf", "svg", "png"] : []).map((format) => {
+    place.replaceChildren(...(shown ? ["pdf", "svg", "png"] : []).map((format) => {
       const button = make("button", format.toUpperCase());
       button.type = "button";
       button.setAttribute("aria-label", `Save the picture of this ${name} as ${format.toUpperCase()}`);
-      button.addEventListener("click", () => ask("export", { what: name, format }));
+      button.addEventListener("click", () => send("export", { panel: name, format }));
       return button;
     }));
   };
@@ -257,33 +257,33 @@ window.vijax = (() => {
   // --- the server ----------------------------------------------------------------------------------------------
   const lost = () => {
     hide(id("lost"), false);
-    // A page with a token is asked for itself, as another server has another token; any other would be made in vain.
-    const asked = new URLSearchParams(location.search).has("token") ? location.href : "static/js/bokeh.min.js";
+    // With a token, the page itself is fetched, as a new server has a new token; otherwise a file, which makes no page.
+    const url = new URLSearchParams(location.search).has("token") ? location.href : "static/js/bokeh.min.js";
     const again = setInterval(async () => {
       try {
-        const answer = await fetch(asked, { cache: "no-store" });
+        const answer = await fetch(url, { cache: "no-store" });
         if (answer.ok) { clearInterval(again); location.reload(); }
       } catch { /* not yet */ }
     }, 1000);
   };
-  const begin = (given) => {
-    ({ channel, pick, across, up, map: figure } = given);
+  const begin = (models) => {
+    ({ channel, pick, across, up, map: figure } = models);
     id("map").addEventListener("keydown", pressed);
     id("map").addEventListener("pointerdown", pointed);
     id("map").addEventListener("pointermove", pointed);
     id("variable").addEventListener("change", colour);
     id("scale").addEventListener("change", colour);
     id("curves").addEventListener("change", colour);
-    id("along").addEventListener("change", () => ask("along", { along: id("along").value }));
-    id("follow").addEventListener("change", () => ask("follow", { follow: id("follow").checked, number: ++number }));
-    id("make").addEventListener("click", () => ask("make"));
-    id("reset").addEventListener("click", () => Object.keys(state.values).forEach((name) => ask("value", { name, number: ++number })));
+    id("along").addEventListener("change", () => send("along", { along: id("along").value }));
+    id("follow").addEventListener("change", () => send("follow", { follow: id("follow").checked, number: ++number }));
+    id("make").addEventListener("click", () => send("make"));
+    id("reset").addEventListener("click", () => Object.keys(state.values).forEach((name) => send("value", { name, number: ++number })));
     id("link").addEventListener("click", () => copied(location.href, id("link")));
-    all(".compute").forEach((one) => one.addEventListener("click", () => ask("open", { name: one.dataset.name })));
-    all(".cancel").forEach((one) => one.addEventListener("click", () => ask("cancel", { name: one.dataset.name })));
+    all(".compute").forEach((button) => button.addEventListener("click", () => send("open", { name: button.dataset.name })));
+    all(".cancel").forEach((button) => button.addEventListener("click", () => send("cancel", { name: button.dataset.name })));
     ["map", "motion"].forEach((name) => files(name, true));
-    ask("ready");
+    send("ready");
   };
-  const colour = () => ask("colour", { variable: id("variable").value, scale: id("scale").value, curves: id("curves").value });
-  return { begin, told, lost, get number() { return number; } };
+  const colour = () => send("colour", { variable: id("variable").value, scale: id("scale").value, curves: id("curves").value });
+  return { begin, receive, lost, get number() { return number; } };
 })();

@@ -1,7 +1,8 @@
-"""One page: what is asked of it, what it answers, and what it computes in between.
+"""One open page on the server: requests of the browser's script, the jobs that they start, and the answers.
 
-The page asks by messages (`Channel.asked`), each handled by a method of `ExplorerPage`, and is told by messages
-(`Channel.told`), which its script writes as text: nothing of a store is ever HTML. Begin with `ExplorerPage.heard`.
+The script sends requests through `Channel.request`; `ExplorerPage` has one method per kind of request. The server
+answers through `Channel.message`. The script displays answers as plain text, so that no content of a store is ever
+interpreted as HTML. Begin with `ExplorerPage.handle_message`.
 """
 
 from contextlib import suppress
@@ -14,76 +15,80 @@ from bokeh.core.properties import Dict, String
 from bokeh.document import Document
 from bokeh.model import DataModel
 
-from vijax.explorer import answers, export, overlay, recipes, view
+from vijax.explorer import export, overlay, view
+from vijax.explorer.analyses import recipes, results
+from vijax.explorer.analyses.motion import CellMotion, motion
+from vijax.explorer.analyses.recipes import Recipe
 from vijax.explorer.drawing import Drawing
-from vijax.explorer.figures import figures, ranged, scale, tables
-from vijax.explorer.jobs import Crew, Jobs, one_line
-from vijax.explorer.motion import CellMotion, motion
-from vijax.explorer.overlay import LaidCurves
+from vijax.explorer.figures import figures, range_limits, scale, tables
+from vijax.explorer.overlay import DrawnCurves
 from vijax.explorer.panels import PANEL_KINDS, PanelRequest
 from vijax.explorer.plane import Axis, ExploredCell, ExploredPlane, cell, explored
-from vijax.explorer.recipes import Recipe
+from vijax.explorer.server.jobs import Jobs, JobThreads, error_line
+from vijax.explorer.server.worker import ProgressCallback
 from vijax.explorer.source import Source
-from vijax.explorer.theme import written
+from vijax.explorer.theme import axis_text
 from vijax.explorer.view import View
-from vijax.explorer.worker import Tell
+from vijax.maps.sweep import sweep
 from vijax.model.quantities import AXES
-from vijax.planes.sweep import sweep
 from vijax.plots.cell_colours import coloured
-from vijax.runtime import checks
+from vijax.runtime import validation
 
 MOST_CELLS = 10**6
-"""Cells of a plane that is made without being asked for twice."""
+"""Most cells of a new map that the page computes without confirmation by the user."""
 
 LINE_DELAY = 200
-"""Milliseconds for which a pick stands still before its line is computed."""
+"""Milliseconds from the display of a cell's motion to the computation of its line; the next motion restarts them."""
 
-_TRAIL = 400  # impacts of picks that stay drawn in the line
+_TRAIL = 400  # most impacts of earlier picked cells that stay drawn in the figure of the line
 
 
 class Channel(DataModel):
-    """What a page asks and is told, each message a dictionary of JSON."""
+    """Messages from the browser's script (`request`) and to the script (`message`), each a JSON dictionary."""
 
-    asked = Dict(String, AnyValue)
-    told = Dict(String, AnyValue)
+    request = Dict(String, AnyValue)
+    message = Dict(String, AnyValue)
 
 
 class ExplorerPage:
-    """A page that somebody looks at.
+    """One open page.
 
     Args:
-        document: Of the session.
-        source: Where its map comes from.
+        document: Document of the session.
+        source: Source of the map and its curves.
         plane: The map.
-        shown: The view that it opens with.
-        crew: The threads of the server.
+        first_view: The view that the page opens with.
+        threads: Threads of the server, which run the page's jobs.
     """
 
-    def __init__(self, document: Document, source: Source, plane: ExploredPlane, shown: View, crew: Crew) -> None:
-        self.document, self.source, self.plane, self.view = document, source, plane, shown
-        self.crew, self.jobs = crew, Jobs(crew, document.add_next_tick_callback)
+    def __init__(
+        self, document: Document, source: Source, plane: ExploredPlane, first_view: View, threads: JobThreads
+    ) -> None:
+        self.document, self.source, self.plane, self.view = document, source, plane, first_view
+        self.threads, self.jobs = threads, Jobs(threads, document.add_next_tick_callback)
         self.channel = Channel(name="channel")
-        made = tables()
-        self.drawing = Drawing(made, *figures(plane, made, source.curves.kinds if source.curves else ()))
-        self.laid = LaidCurves()
+        page_tables = tables()
+        self.drawing = Drawing(page_tables, *figures(plane, page_tables, source.curves.kinds if source.curves else ()))
+        self.drawn_curves = DrawnCurves()
         self.cell: ExploredCell | None = None
         self.motion: CellMotion | None = None
         self.exports: dict[str, Any] = {}
         self._trail: list[tuple[float, float]] = []
-        self._made = False
-        # Panels of the picked cell that hold or compute something; and those of the address, which wait for a motion.
+        self._recomputed = False
+        # `_opened`: panels of the picked cell that have a result or a running job. `_pending`: panels that the address
+        # of the page requests; they are opened after the first motion is computed.
         self._opened: set[str] = set()
-        self._pending = shown.panels
-        self._wait: Any = None  # The timer after which the line is computed.
+        self._pending = first_view.panels
+        self._wait: Any = None  # timer after which the line is computed
         self._stamp = source.stamp()
-        self.channel.on_change("asked", lambda attribute, old, new: self.heard(new))
+        self.channel.on_change("request", lambda attribute, old, new: self.handle_message(new))
 
     # --- messages ----------------------------------------------------------------------------------------------------
 
-    def heard(self, message: dict[str, Any]) -> None:
-        """Do what the page asks; an error is shown in one line.
+    def handle_message(self, message: dict[str, Any]) -> None:
+        """Handle a request of the browser's script; the page shows an error in one line.
 
-        A message can be anything that JSON can hold: infinity, a number with 400 digits, a list where a name is due.
+        A request is not trusted: it may hold any JSON, such as a number with 400 digits or a list in place of a name.
         """
         kinds = {
             "ready": self._ready,
@@ -103,26 +108,27 @@ class ExplorerPage:
         try:
             handler(message)
         except Exception as error:
-            self.tell("note", text=one_line(error), error=True)
-            self._tell_view()
+            self.send("note", text=error_line(error), error=True)
+            self._send_view()
 
-    def tell(self, section: str, **content: Any) -> None:
-        """Tell the page what one section of it is to show."""
-        self.channel.update(told={"section": section, **content})
+    def send(self, section: str, **content: Any) -> None:
+        """Send a message: the new content of one section of the page."""
+        self.channel.update(message={"section": section, **content})
 
     def _ready(self, message: dict[str, Any]) -> None:
-        self._tell_page()
+        self._send_page()
         self._draw_map()
         self._scale_diagrams()
         self._run(0)
 
     def _pick(self, message: dict[str, Any]) -> None:
         columns, rows = self.plane.shape
-        column, row, number = (view.whole(message, name) for name in ("column", "row", "number"))
+        column, row, number = (view.read_integer(message, name) for name in ("column", "row", "number"))
         pick = min(max(column, 0), columns - 1), min(max(row, 0), rows - 1)
         values = dict(self.view.values)
         if self.view.follow and self.motion is not None:
-            # A rigid gap holds its start, and a soft one nearly so: a start is never far within a membrane.
+            # A start must lie within the gap. The end of a motion may lie slightly outside, in contact with a membrane,
+            # so it is clipped.
             half = 0.5 * float(self.plane.stored("d", pick, values))
             ends = dict(zip(("u0", "v0"), self.motion.end, strict=True))
             limits = view.bounds(self.plane) | {"u0": (-half, half)}
@@ -131,16 +137,16 @@ class ExplorerPage:
         self._run(number)
 
     def _colour(self, message: dict[str, Any]) -> None:
-        asked = view.from_query(self.plane, {name: message[name] for name in ("variable", "scale", "curves")})
-        self.view = replace(self.view, variable=asked.variable, scale=asked.scale, curves=asked.curves)
+        requested = view.from_query(self.plane, {name: message[name] for name in ("variable", "scale", "curves")})
+        self.view = replace(self.view, variable=requested.variable, scale=requested.scale, curves=requested.curves)
         self._draw_map()
-        self._tell_view()
+        self._send_view()
 
     def _value(self, message: dict[str, Any]) -> None:
-        name, number = str(message["name"]), view.whole(message, "number")
+        name, number = str(message["name"]), view.read_integer(message, "number")
         values = {key: value for key, value in self.view.values.items() if key != name}
         if message.get("value") is not None:
-            values |= view.checked(self.plane, {name: message["value"]})
+            values |= view.validated_values(self.plane, {name: message["value"]})
         self.view = replace(self.view, values=values, panels=())
         if name in self.plane.further:
             self._draw_map()
@@ -154,237 +160,239 @@ class ExplorerPage:
         if self.cell is not None:
             self.drawing.stand(self.cell.arguments[self.view.along])
         self._start("line")
-        self._tell_view()
+        self._send_view()
 
     def _follow(self, message: dict[str, Any]) -> None:
-        number = view.whole(message, "number")
+        number = view.read_integer(message, "number")
         values = {name: value for name, value in self.view.values.items() if name not in ("u0", "v0")}
         self.view = replace(self.view, follow=bool(message["follow"]), values=values)
         self._trail.clear()
         self._run(number)
 
     def _open(self, message: dict[str, Any]) -> None:
-        name = checks.choice("open", message["name"], view.PANELS)
-        self.view = replace(self.view, panels=tuple(one for one in view.PANELS if one in (*self.view.panels, name)))
+        name = validation.validate_choice("open", message["name"], view.PANELS)
+        self.view = replace(
+            self.view, panels=tuple(panel for panel in view.PANELS if panel in (*self.view.panels, name))
+        )
         self._start(name)
-        self._tell_view()
+        self._send_view()
 
     def _cancel(self, message: dict[str, Any]) -> None:
         name = str(message["name"])
         if self.jobs.cancel(name):
-            self.tell("panel", name=name, state="cancelled", text="Cancelled.", rows=[])
+            self.send("panel", name=name, state="cancelled", text="Cancelled.", rows=[])
 
-    # --- what is computed --------------------------------------------------------------------------------------------
+    # --- computation -------------------------------------------------------------------------------------------------
 
     @property
     def axis(self) -> Axis:
-        """Give the axis along which line, branch and optimum go."""
+        """Return the axis along which the line, the branch and the optima are computed."""
         return self.plane.x if self.view.along == self.plane.x.name else self.plane.y
 
     def _run(self, number: int) -> None:
-        """Find what the picked cell does; `number` is of the page's request, and comes back with the answer."""
+        """Compute the motion of the picked cell; the answer to the script repeats the request's `number`."""
         self._clear_panels()
         column, row = self.view.pick
         self.drawing.pick(float(self.plane.x.values[column]), float(self.plane.y.values[row]))
         plane, pick, values = self.plane, self.view.pick, dict(self.view.values)
 
-        # Not even a pair is made on the event loop: JAX may be compiling, and then waits.
-        def work(tell: Tell) -> tuple[ExploredCell, CellMotion]:
-            found = cell(plane, pick, values)
-            return found, motion(found)
+        # The thread builds the cell too, because `cell` may wait for a compilation and would block the event loop.
+        def work(report: ProgressCallback) -> tuple[ExploredCell, CellMotion]:
+            picked_cell = cell(plane, pick, values)
+            return picked_cell, motion(picked_cell)
 
-        self.jobs.start("motion", work, partial(self._moved, number), self._failed("motion"))
-        self._tell_view()
+        self.jobs.start("motion", work, partial(self._show_motion, number), self._failed("motion"))
+        self._send_view()
 
-    def _moved(self, number: int, answer: tuple[ExploredCell, CellMotion]) -> None:
+    def _show_motion(self, number: int, answer: tuple[ExploredCell, CellMotion]) -> None:
         self.cell, self.motion = answer
-        found = self.motion
-        self.tell("panel", name="motion", state="done", text="", rows=[])
-        self.drawing.motion(found)
-        place = self.cell.arguments[self.view.along]
-        self._trail += [(place, float(speed)) for speed in found.impacts["v"]]
+        cell_motion = self.motion
+        self.send("panel", name="motion", state="done", text="", rows=[])
+        self.drawing.motion(cell_motion)
+        position = self.cell.arguments[self.view.along]
+        self._trail += [(position, float(speed)) for speed in cell_motion.impacts["v"]]
         del self._trail[:-_TRAIL]
         self.drawing.visited(self._trail if self.view.follow else [])
-        note = answers.disagreement(self.plane, dict(self.view.values), self.view.pick, found)
-        rows = answers.cell_rows(self.cell, found)
+        note = results.disagreement(self.plane, dict(self.view.values), self.view.pick, cell_motion)
+        rows = results.cell_rows(self.cell, cell_motion)
         if not self.plane.differs(self.view.values):
-            rows += answers.curves_row(self.laid, self.plane, self.view.pick)
-        self.tell("cell", number=number, heading=answers.heading(found), rows=rows, note=note)
-        self._tell_recipe("motion", recipes.of_motion(self.cell, found))
-        self.exports["motion"] = (self.cell, found)
-        self.drawing.stand(place)
+            rows += results.curves_row(self.drawn_curves, self.plane, self.view.pick)
+        self.send("cell", number=number, heading=results.heading(cell_motion), rows=rows, note=note)
+        self._send_recipe("motion", recipes.of_motion(self.cell, cell_motion))
+        self.exports["motion"] = (self.cell, cell_motion)
+        self.drawing.stand(position)
         for name in self._pending:
             self._start(name)
         self._pending = ()
-        self._line_later()
+        self._schedule_line()
 
-    def _line_later(self) -> None:
-        """Compute the line once the pick has stood still for a moment: it would keep the motion from the screen."""
+    def _schedule_line(self) -> None:
+        """Compute the line `LINE_DELAY` after the last displayed motion, so that it does not delay a dragged pick."""
         if self._wait is not None:
-            with suppress(ValueError):  # it has run meanwhile
+            with suppress(ValueError):  # raised if the timer has already run
                 self.document.remove_timeout_callback(self._wait)
         self.jobs.cancel("line")
         self._wait = self.document.add_timeout_callback(lambda: self._start("line"), LINE_DELAY)
 
     def _start(self, name: str) -> None:
-        """Compute a panel."""
+        """Start the job that computes a panel of the picked cell, and show the result when the job is done."""
         if self.cell is None or self.motion is None:
             return
         if name in view.PANELS:
             self._opened.add(name)
-        kind, asked = PANEL_KINDS[name], PanelRequest(self.plane, self.cell, self.motion, self.axis)
-        self.tell("panel", name=name, state="running", text="Computing\u2026", rows=[])
+        kind, request = PANEL_KINDS[name], PanelRequest(self.plane, self.cell, self.motion, self.axis)
+        self.send("panel", name=name, state="running", text="Computing\u2026", rows=[])
 
-        def done(found: Any) -> None:
-            text, rows = kind.show(self.drawing, asked, found)
-            self.exports[name] = found
-            self.tell("panel", name=name, state="done", text=text, rows=rows)
-            self._tell_recipe(name, kind.recipe(asked))
+        def done(result: Any) -> None:
+            text, rows = kind.show(self.drawing, request, result)
+            self.exports[name] = result
+            self.send("panel", name=name, state="done", text=text, rows=rows)
+            self._send_recipe(name, kind.recipe(request))
 
         self.jobs.start(
-            name, partial(kind.work, asked, self.crew.worker(name)), done, self._failed(name), self._progress(name)
+            name, partial(kind.work, request, self.threads.worker(name)), done, self._failed(name), self._progress(name)
         )
 
     def _clear_panels(self) -> None:
-        """Take off the panels of another cell, and nothing else: to empty an empty figure is to draw it once more."""
+        """Clear the opened panels of the previous cell; empty figures stay, because Bokeh would redraw cleared ones."""
         for name in self._opened:
             self.jobs.cancel(name)
             self.exports.pop(name, None)
             PANEL_KINDS[name].clear(self.drawing)
-            self.tell("panel", name=name, state="idle", text="", rows=[])
+            self.send("panel", name=name, state="idle", text="", rows=[])
         self._opened.clear()
 
     def _failed(self, name: str) -> Any:
-        def failed(said: str) -> None:
-            self.tell("panel", name=name, state="failed", text=said, rows=[])
+        def failed(message: str) -> None:
+            self.send("panel", name=name, state="failed", text=message, rows=[])
 
         return failed
 
     def _progress(self, name: str) -> Any:
-        return lambda done, total: self.tell("progress", name=name, done=done, total=total)
+        return lambda done, total: self.send("progress", name=name, done=done, total=total)
 
     # --- the plane ---------------------------------------------------------------------------------------------------
 
     def _make(self, message: dict[str, Any]) -> None:
-        """Sweep the plane with the values of the sliders in place of the map's, in the background."""
+        """Start a job that computes the map anew, with the sliders' values in place of the map's fixed values."""
         plane, values = self.plane, dict(self.view.values)
         count = plane.x.values.size * plane.y.values.size
-        if count > MOST_CELLS and not message.get("sure"):
-            self.tell("ask", text=f"This plane has {count:,} cells and may take long. Make it?")
+        if count > MOST_CELLS and not message.get("confirmed"):
+            self.send("confirm", text=f"This plane has {count:,} cells and may take long. Make it?")
             return
         first = plane.arguments((0, 0), values)
         axes: dict[str, Any] = first | {plane.x.name: plane.x.values, plane.y.name: plane.y.values}
-        self.tell("panel", name="plane", state="running", text="Computing\u2026", rows=[])
+        self.send("panel", name="plane", state="running", text="Computing\u2026", rows=[])
         self.jobs.start(
             "plane",
-            lambda tell: explored(sweep(device=plane.device, progress=tell, **plane.settings(), **axes)),
+            lambda report: explored(sweep(device=plane.device, progress=report, **plane.settings(), **axes)),
             self._remade,
             self._failed("plane"),
             self._progress("plane"),
         )
 
     def _remade(self, plane: ExploredPlane) -> None:
-        self.plane, self._made = plane, True
-        self._tell_page()
+        self.plane, self._recomputed = plane, True
+        self._send_page()
         self._draw_map()
-        self.tell("panel", name="plane", state="done", text="The map is of these values.", rows=[])
+        self.send("panel", name="plane", state="done", text="The map is of these values.", rows=[])
         self._run(0)
 
     def refresh(self) -> None:
-        """Read the store again if it has changed; a store that cannot be read any more leaves the map as it is."""
+        """Read the map again if its store has changed; if the store is unreadable, the displayed map stays."""
         stamp = self.source.stamp()
-        if self._made or stamp == self._stamp:
+        if self._recomputed or stamp == self._stamp:
             return
         self._stamp = stamp
-        self.jobs.start("store", lambda tell: self.source.plane(), self._reread, self._unread)
+        self.jobs.start("store", lambda report: self.source.plane(), self._show_reread_map, self._report_read_error)
 
-    def _reread(self, plane: ExploredPlane) -> None:
+    def _show_reread_map(self, plane: ExploredPlane) -> None:
         self.plane = plane
-        self.tell("note", text="", error=False)
+        self.send("note", text="", error=False)
         self._draw_map()
 
-    def _unread(self, said: str) -> None:
-        self.tell("note", text=f"The store cannot be read any more; the map is as it was. {said}", error=True)
+    def _report_read_error(self, message: str) -> None:
+        self.send("note", text=f"The store cannot be read any more; the map is as it was. {message}", error=True)
 
     def _draw_map(self) -> None:
-        shown = self.plane.sliced(self.view.values)
+        map_part = self.plane.sliced(self.view.values)
         log = None if self.view.scale == "auto" else self.view.scale == "log"
-        found = coloured(shown, self.view.variable, self.plane.x.name, self.plane.y.name, log)
-        self.drawing.map(self.plane, found)
-        self.exports["map"] = (shown, self.view.variable, *self._lay(shown))
-        self._tell_recipe("map", recipes.of_map(self.source, self.plane, self.view, self._made, bool(self.laid.pieces)))
-        entries = [[one.sign, one.colour, one.text, one.count] for one in found.legend]
-        self.tell("legend", title=found.title, entries=entries)
+        coloured_map = coloured(map_part, self.view.variable, self.plane.x.name, self.plane.y.name, log)
+        self.drawing.map(self.plane, coloured_map)
+        self.exports["map"] = (map_part, self.view.variable, *self._draw_curves(map_part))
+        self._send_recipe(
+            "map", recipes.of_map(self.source, self.plane, self.view, self._recomputed, bool(self.drawn_curves.pieces))
+        )
+        entries = [[entry.sign, entry.colour, entry.text, entry.count] for entry in coloured_map.legend]
+        self.send("legend", title=coloured_map.title, entries=entries)
 
-    def _lay(self, shown: Any) -> tuple[Any, bool]:
-        """Lay the curves over the part of the map that is shown; give what a picture of it draws of them."""
+    def _draw_curves(self, map_part: Any) -> tuple[Any, bool]:
+        """Draw the curves over the map; return the curves' dataset or None, and whether unstable parts are shown."""
         curves = self.source.curves
         if curves is None:
             return None, False
-        found = self.laid = overlay.laid(curves, self.plane, shown, self.view.curves)
-        self.drawing.curves(found)
-        legend, points = answers.curves_legend(found), answers.curves_points(found, self.plane)
-        self.tell("curves", text=found.said, entries=legend, points=points)
-        return (curves.dataset if found.pieces else None), self.view.curves == "unstable"
+        drawn_curves = self.drawn_curves = overlay.select_curves(curves, self.plane, map_part, self.view.curves)
+        self.drawing.curves(drawn_curves)
+        legend, points = results.curves_legend(drawn_curves), results.curves_points(drawn_curves, self.plane)
+        self.send("curves", text=drawn_curves.note, entries=legend, points=points)
+        return (curves.dataset if drawn_curves.pieces else None), self.view.curves == "unstable"
 
     def _scale_diagrams(self) -> None:
-        """Put the axes of line and branch on the axis that they go along."""
-        for one in (self.drawing.figures.line, self.drawing.figures.branch):
-            one.x_range.update(**ranged(self.axis))
-            scale(one, self.axis)
+        """Set the horizontal axes of the figures of line and branch to the selected axis of the map, `self.axis`."""
+        for diagram in (self.drawing.figures.line, self.drawing.figures.branch):
+            diagram.x_range.update(**range_limits(self.axis))
+            scale(diagram, self.axis)
 
-    # --- what is told ------------------------------------------------------------------------------------------------
+    # --- messages to the page's script -------------------------------------------------------------------------------
 
-    def _tell_page(self) -> None:
+    def _send_page(self) -> None:
         plane = self.plane
         axes = {
-            place: {
-                "name": axis.name,
-                "edges": axis.edges.tolist(),
-                "values": axis.values.tolist(),
-            }
+            place: {"name": axis.name, "edges": axis.edges.tolist(), "values": axis.values.tolist()}
             for place, axis in (("x", plane.x), ("y", plane.y))
         }
         sliders = [
-            {"name": name, "label": written(name), "low": low, "high": high, "value": self._held(name)}
+            {"name": name, "label": axis_text(name), "low": low, "high": high, "value": self._map_value(name)}
             for name, (low, high) in view.bounds(plane).items()
         ]
-        self.tell("page", title=self.source.name, variables=list(plane.variables), axes=axes, sliders=sliders)
+        self.send("page", title=self.source.name, variables=list(plane.variables), axes=axes, sliders=sliders)
 
-    def _held(self, name: str) -> float:
-        """Give the value that the map has of what can be moved."""
+    def _map_value(self, name: str) -> float:
+        """Return the value of a slider's quantity in the map, where the slider stands before the user moves it."""
         if name in self.plane.further:
             return float(self.plane.further[name][0])
         if name in self.plane.fixed:
             return self.plane.fixed[name]
         return float(self.plane.dataset[name].values.flat[0])
 
-    def _tell_view(self) -> None:
-        shown = self.view
-        self.tell(
+    def _send_view(self) -> None:
+        current = self.view
+        self.send(
             "view",
-            query=view.query(shown),
-            variable=shown.variable,
-            scale=shown.scale,
-            curves=shown.curves,
-            pick=list(shown.pick),
-            values=dict(shown.values),
-            along=shown.along,
-            follow=shown.follow,
-            moved=[AXES[name].text for name in self.plane.differs(shown.values)],
+            query=view.query(current),
+            variable=current.variable,
+            scale=current.scale,
+            curves=current.curves,
+            pick=list(current.pick),
+            values=dict(current.values),
+            along=current.along,
+            follow=current.follow,
+            moved=[AXES[name].text for name in self.plane.differs(current.values)],
         )
 
-    def _tell_recipe(self, name: str, recipe: Recipe) -> None:
-        self.tell("recipe", name=name, command=recipe.command, python=recipe.python)
+    def _send_recipe(self, name: str, recipe: Recipe) -> None:
+        self.send("recipe", name=name, command=recipe.command, python=recipe.python)
 
     def _export(self, message: dict[str, Any]) -> None:
-        what, ending = str(message["what"]), str(message["format"])
-        if what not in self.exports:
-            raise ValueError(f"what must have been computed to be exported; got {checks.shown(what)}; compute it first")
-        found = self.exports[what]
+        panel, extension = str(message["panel"]), str(message["format"])
+        if panel not in self.exports:
+            raise ValueError(
+                f"panel must have been computed to be exported; got {validation.value_text(panel)}; compute it first"
+            )
+        content = self.exports[panel]
         self.jobs.start(
             "export",
-            lambda tell: export.picture(what, found, ending),
-            lambda content: self.tell("file", name=f"{what}.{ending}", content=content),
-            lambda said: self.tell("note", text=said, error=True),
+            lambda report: export.picture(panel, content, extension),
+            lambda file_content: self.send("file", name=f"{panel}.{extension}", content=file_content),
+            lambda message: self.send("note", text=message, error=True),
         )

@@ -1,28 +1,31 @@
-"""The panels beside the motion: what each computes, and how it is drawn, told and reproduced."""
+"""All panels except that of the motion: line, basin, branch and optima.
+
+For each panel, functions compute its result, draw and describe it, and return the code that reproduces it.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from vijax.explorer import answers, recipes
-from vijax.explorer.basin import basin
-from vijax.explorer.branch import branch
+from vijax.explorer.analyses import recipes, results
+from vijax.explorer.analyses.basin import basin
+from vijax.explorer.analyses.branch import branch
+from vijax.explorer.analyses.line import line
+from vijax.explorer.analyses.motion import CellMotion
+from vijax.explorer.analyses.optimum import optima
+from vijax.explorer.analyses.recipes import Recipe
 from vijax.explorer.drawing import Drawing
-from vijax.explorer.line import line
-from vijax.explorer.motion import CellMotion
-from vijax.explorer.optimum import optima
 from vijax.explorer.plane import Axis, ExploredCell, ExploredPlane
-from vijax.explorer.recipes import Recipe
-from vijax.explorer.worker import Tell, Worker
+from vijax.explorer.server.worker import ProgressCallback, Worker
 
 
 @dataclass(frozen=True)
 class PanelRequest:
-    """What a panel is computed from.
+    """Input of a panel's computation.
 
     Attributes:
-        plane, cell, motion: The picked cell and what it does.
-        axis: Along which line, branch and optimum go.
+        plane, cell, motion: The map, the picked cell and its motion.
+        axis: Axis along which the line, the branch and the optima are computed.
     """
 
     plane: ExploredPlane
@@ -36,65 +39,65 @@ class PanelKind:
     """One kind of panel.
 
     Attributes:
-        work: Computes what it shows, in a thread or, by the worker that it is given, in a process.
-        recipe: Says how that is had again.
-        show: Draws it, and gives the text and the rows of its table.
-        clear: Takes it off the figures.
+        work: Computes the result, in the calling thread or in the process of the given worker.
+        recipe: Returns the code that reproduces the panel.
+        show: Draws the result, and returns the panel's text and the rows of its table.
+        clear: Removes the result from the figures.
     """
 
-    work: Callable[[PanelRequest, Worker, Tell], Any]
+    work: Callable[[PanelRequest, Worker, ProgressCallback], Any]
     recipe: Callable[[PanelRequest], Recipe]
-    show: Callable[[Drawing, PanelRequest, Any], tuple[str, answers.Rows]]
+    show: Callable[[Drawing, PanelRequest, Any], tuple[str, results.Rows]]
     clear: Callable[[Drawing], Any]
 
 
-def _show_line(drawing: Drawing, asked: PanelRequest, found: Any) -> tuple[str, answers.Rows]:
-    drawing.line(found)
-    return answers.line_text(found), []
+def _show_line(drawing: Drawing, request: PanelRequest, diagram: Any) -> tuple[str, results.Rows]:
+    drawing.line(diagram)
+    return results.line_text(diagram), []
 
 
-def _show_basin(drawing: Drawing, asked: PanelRequest, found: Any) -> tuple[str, answers.Rows]:
-    return "", answers.basin_rows(found, drawing.basin(found))
+def _show_basin(drawing: Drawing, request: PanelRequest, cell_basin: Any) -> tuple[str, results.Rows]:
+    return "", results.basin_rows(cell_basin, drawing.basin(cell_basin))
 
 
-def _show_branch(drawing: Drawing, asked: PanelRequest, found: Any) -> tuple[str, answers.Rows]:
-    drawing.branch(found)
-    return answers.branch_text(found), answers.branch_rows(found)
+def _show_branch(drawing: Drawing, request: PanelRequest, cell_branch: Any) -> tuple[str, results.Rows]:
+    drawing.branch(cell_branch)
+    return results.branch_text(cell_branch), results.branch_rows(cell_branch)
 
 
-def _show_optimum(drawing: Drawing, asked: PanelRequest, found: Any) -> tuple[str, answers.Rows]:
-    column, row = (asked.cell.arguments[axis.name] for axis in (asked.plane.x, asked.plane.y))
-    along_x = asked.axis.name == asked.plane.x.name
-    drawing.optima([(one.value, row) if along_x else (column, one.value) for one in found])
-    if not found:
+def _show_optimum(drawing: Drawing, request: PanelRequest, optima_list: Any) -> tuple[str, results.Rows]:
+    column, row = (request.cell.arguments[axis.name] for axis in (request.plane.x, request.plane.y))
+    along_x = request.axis.name == request.plane.x.name
+    drawing.optima([(item.value, row) if along_x else (column, item.value) for item in optima_list])
+    if not optima_list:
         return "No admissible periodic motion was found along this axis.", []
-    return "Orange diamonds on the map, the nearest first.", answers.optimum_rows(asked.axis, found)
+    return "Orange diamonds on the map, the nearest first.", results.optimum_rows(request.axis, optima_list)
 
 
 PANEL_KINDS = {
     "line": PanelKind(
-        lambda asked, worker, tell: line(asked.cell, asked.axis, tell),
-        lambda asked: recipes.of_line(asked.cell, asked.axis),
+        lambda request, worker, report: line(request.cell, request.axis, report),
+        lambda request: recipes.of_line(request.cell, request.axis),
         _show_line,
-        lambda drawing: None,  # it stays until the next one is there, as a pick that is dragged moves along it
+        lambda drawing: None,  # the line stays while the user drags the pick along it; the next line replaces it
     ),
     "basin": PanelKind(
-        lambda asked, worker, tell: basin(asked.cell, tell),
-        lambda asked: recipes.of_basin(asked.cell),
+        lambda request, worker, report: basin(request.cell, report),
+        lambda request: recipes.of_basin(request.cell),
         _show_basin,
         lambda drawing: drawing.basin(None),
     ),
     "branch": PanelKind(
-        lambda asked, worker, tell: worker.run(branch, (asked.cell, asked.motion, asked.axis), tell),
-        lambda asked: recipes.of_branch(asked.cell, asked.motion, asked.axis),
+        lambda request, worker, report: worker.run(branch, (request.cell, request.motion, request.axis), report),
+        lambda request: recipes.of_branch(request.cell, request.motion, request.axis),
         _show_branch,
         lambda drawing: drawing.branch(None),
     ),
     "optimum": PanelKind(
-        lambda asked, worker, tell: worker.run(optima, (asked.cell, asked.axis), tell),
-        lambda asked: recipes.of_optimum(asked.cell, asked.axis),
+        lambda request, worker, report: worker.run(optima, (request.cell, request.axis), report),
+        lambda request: recipes.of_optimum(request.cell, request.axis),
         _show_optimum,
         lambda drawing: drawing.optima([]),
     ),
 }
-"""The panels by their names, in the order of the page."""
+"""Kinds of panels by name, in the order of the page."""

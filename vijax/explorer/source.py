@@ -1,4 +1,4 @@
-"""Where the map of a page and its curves come from: datasets, or stores; that of the map may grow, be damaged or go."""
+"""Source of a page's map and curves: datasets or stores. The store of a map may change while pages are open."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -7,39 +7,42 @@ import numpy as np
 
 from vijax.explorer import overlay
 from vijax.explorer.plane import ExploredPlane, explored
-from vijax.explorer.worker import one_line
-from vijax.planes import store_names
-from vijax.planes.store import load
-from vijax.planes.sweep import sweep
+from vijax.explorer.server.worker import error_line
+from vijax.maps.storage import store_names
+from vijax.maps.storage.store import load
+from vijax.maps.sweep import sweep
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
 class Source:
-    """A map, read again when its files have changed, and curves over it, which are read once.
+    """A map and, optionally, its bifurcation curves. The map is read again when its store changes, the curves are not.
 
-    `name` says what it is in a few words.
+    The attribute `name` is a short description of the map for the user.
 
     Args:
-        given: A dataset, the path of a store, or None for a small plane that is made when it is first read.
-        curves: What `curve_dataset` returned, the path of a store of it, or None.
+        dataset: A dataset, the path of a store, or None for a small plane that is computed when it is first read.
+        curves: Result of `curve_dataset`, the path of its store, or None.
 
     Raises:
-        ValueError, OSError: What is wrong with the curves.
+        ValueError, OSError: The curves are invalid.
     """
 
     def __init__(
-        self, given: "xr.Dataset | str | Path | None", curves: "xr.Dataset | str | Path | None" = None
+        self, dataset: "xr.Dataset | str | Path | None", curves: "xr.Dataset | str | Path | None" = None
     ) -> None:
-        self.path = Path(given) if isinstance(given, str | Path) else None
-        self._dataset: xr.Dataset | None = None if isinstance(given, str | Path) else given
-        self.name = self.path.name if self.path else "the default plane" if given is None else "a dataset"
-        self.curves = None if curves is None else overlay.taken(curves)
+        self.path = Path(dataset) if isinstance(dataset, str | Path) else None
+        self._dataset: xr.Dataset | None = None if isinstance(dataset, str | Path) else dataset
+        self.name = self.path.name if self.path else "the default plane" if dataset is None else "a dataset"
+        self.curves = None if curves is None else overlay.read_curves(curves)
         self._read: tuple[tuple[int, int], ExploredPlane] | None = None
 
     def stamp(self) -> tuple[int, int]:
-        """Tell a state of the store from any other: how many tiles are done, and when a file of it was last written."""
+        """Return a value that changes when the map's store changes; (0, 0) without a store.
+
+        The value is the number of finished tiles and the latest modification time of the files in ns.
+        """
         if self.path is None:
             return 0, 0
         records = [file for file in (self.path / store_names.TILES).glob("[0-9]*.json")]
@@ -47,26 +50,27 @@ class Source:
         return len(records), max((file.stat().st_mtime_ns for file in files if file.exists()), default=0)
 
     def plane(self) -> ExploredPlane:
-        """Read the map, or return what was read if nothing has changed since.
+        """Return the map; it is read again only if its store has changed.
 
         Raises:
-            ValueError, OSError: What is wrong with it, in one line: a damaged or hostile store raises anything.
+            ValueError, OSError: The map cannot be read. Other errors, of a damaged or hostile store, are converted to
+                ValueError.
         """
         stamp = self.stamp()
         if self._read is None or self._read[0] != stamp:
             try:
-                self._read = stamp, explored(self._found())
+                self._read = stamp, explored(self._read_dataset())
             except MemoryError as error:
-                raise ValueError(f"the map must fit in memory; got {self.name} ({one_line(error)})") from None
+                raise ValueError(f"the map must fit in memory; got {self.name} ({error_line(error)})") from None
             except (ValueError, OSError):
                 raise
             except Exception as error:
-                cause = f"{type(error).__name__}: {one_line(error)}"
+                cause = f"{type(error).__name__}: {error_line(error)}"
                 raise ValueError(f"the map must be one that vijax.sweep made; got {self.name} ({cause})") from error
         return self._read[1]
 
     def check(self) -> None:
-        """Read the map, and raise ValueError or OSError unless it can be shown, and the curves are of it."""
+        """Read the map; raise ValueError or OSError unless the page can show it and the curves belong to it."""
         try:
             plane = self.plane()
         except (ValueError, OSError) as error:
@@ -74,7 +78,7 @@ class Source:
         if self.curves is not None:
             overlay.check(self.curves, plane, self.path)
 
-    def _found(self) -> "xr.Dataset":
+    def _read_dataset(self) -> "xr.Dataset":
         if self.path is not None:
             return load(self.path)
         if self._dataset is None:

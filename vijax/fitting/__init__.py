@@ -1,5 +1,5 @@
-"""A device from the impacts that a bench has measured.
+"""Fit of a device to impact times measured on a test bench.
 
-What lies between two impacts, how well a series of impacts hangs together, the least squares, and what they tell.
-Begin with `fit`.
+`fit` is the public function. `interval` computes the motion between two impacts, `time_equations` the equations between
+the times, `adjustment`, `assignment` and `least_squares` the least squares, `evaluation` the resulting record.
 """

@@ -1,7 +1,8 @@
-"""What lies between two impacts whose times are known: one contact and one flight, and nothing is searched for.
+"""The motion between two impacts with known times: one contact and one flight, in closed form.
 
-The ball enters a wall at one time and meets the next wall at another. How fast it must have been then follows: so one
-interval says at which speed each of its impacts happens, whatever came before. Chaos has no time to grow.
+The ball enters a wall at one time and hits the next wall at another. These two conditions determine its entry speed and
+contact duration. So one interval yields the speeds at both of its impacts, independent of the motion before. No error
+grows over more than one interval, even in chaotic motion.
 """
 
 from collections.abc import Callable
@@ -15,29 +16,32 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from vijax.fitting.shaking import Shaking
+from vijax.fitting.fit_excitation import FitExcitation
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.runtime.arrays import Flag, Scalar, Values
-from vijax.runtime.linear_solve import solve
+from vijax.runtime.numerics.linear_solve import solve
 
-# Newton's steps, most of which take 5; a step changes neither number by more than half, and the last by less than this.
+# Newton's method: the limit of steps (most solutions take 5), the largest relative change of an unknown in one step,
+# and the relative change that ends the iteration.
 _MOST_STEPS = 15
 _HALF = 0.5
-_ARRIVED = 1e-10
-# A contact is looked for at so many durations, closer to each other where they are short, up to so many half turns of
-# the membrane; the longest is shorter than that by this share of the way between two.
+_STEP_TOLERANCE = 1e-10
+# Guesses of the contact duration: their number (denser where short), the longest as a number of half periods of the
+# membrane, and the fraction of a grid step subtracted from the longest, so that the flight after it has a positive
+# duration.
 _DURATIONS, _HALF_TURNS, _SHORTEST = 65, 8, 1e-6
-# Of an interval so many motions are told: where the miss changes its sign, and two each where it turns back.
+# Largest numbers of sign changes of the mismatch (see `guess_motions`), with one motion each, and of turning points of
+# the mismatch near 0, with two motions each.
 _CROSSINGS, _TURNS = 4, 2
-_HALVINGS = 10  # A change of sign between two durations is narrowed down so often before Newton begins.
+_HALVINGS = 10  # bisections of a sign change between two durations before Newton's method
 _MOTIONS = _CROSSINGS + 2 * _TURNS
-# Places in a contact and in a flight where the ball must be on the right side of the walls.
+# Fractions of a contact, and of a flight, where the position of the ball is checked against the walls.
 _PLACES = tuple(k / 8 for k in range(1, 8))
 
 
 class Ends(eqx.Module):
-    """Two impacts that follow each other: their walls, -1 or +1, and their onsets in half forcing periods."""
+    """Two consecutive impacts: their walls, -1 or +1, and their onsets in half forcing periods."""
 
     side: Scalar
     next_side: Scalar
@@ -46,180 +50,209 @@ class Ends(eqx.Module):
 
 
 class Motion(eqx.Module):
-    """A motion from an impact to the next: how fast it enters the first wall, and how long it stays; NaN for none.
+    """A motion from an impact to the next, as a guess for Newton's method; NaN for no motion.
 
-    Of a rigid wall it needs not be known.
+    A motion that begins at a rigid wall needs no guess.
+
+    Attributes:
+        speed: Entry speed at the first wall.
+        contact_duration: Contact duration at the first wall.
     """
 
     speed: Values
-    stay: Values
+    contact_duration: Values
 
 
 class Interval(eqx.Module):
-    """What an interval says.
+    """The solution of an interval.
 
     Attributes:
-        speed: How fast the ball enters the first wall, > 0; NaN where no motion leads from one impact to the other.
-        stay: How long it stays there.
-        arrival: Its velocity as it meets the next wall.
-        outside: How far it would pass through a wall on its way; at most 0 if it meets none.
+        speed: Entry speed at the first wall, > 0; NaN if no motion leads from one impact to the other.
+        contact_duration: Contact duration at the first wall.
+        arrival: Velocity at the next impact.
+        outside: Largest distance of the flight beyond a wall; at most 0 if the flight hits no wall between the impacts.
     """
 
     speed: Values
-    stay: Values
+    contact_duration: Values
     arrival: Values
     outside: Values
 
 
-class _Followed(NamedTuple):
-    """What a speed at the onset and a duration of the contact lead to.
+class _Response(NamedTuple):
+    """Result of an entry speed and a contact duration.
 
     Attributes:
-        missed: What must be 0: penetration as the contact ends, over its duration, and distance to the next wall.
-        out: Velocity as the contact ends.
+        residual: Residuals: penetration at the end of the contact over its duration, and distance to the next wall.
+        out: Velocity at the end of the contact.
         arrival: Velocity at the next onset.
     """
 
-    missed: Any
+    residual: Any
     out: Any
     arrival: Any
 
 
 class Restitution(eqx.Module):
-    """What is added to r at an impact: offset + slope times its speed. Both are 0; derivatives by them test r."""
+    """Term added to r at an impact: offset + slope * impact speed.
+
+    Both numbers are 0. Only derivatives by them are used, to test whether r depends on the speed.
+    """
 
     offset: Scalar
     slope: Scalar
 
 
-def interval(pair: ImpactPair, shaking: Shaking, added: Restitution, ends: Ends, near: Motion) -> Interval:
-    """Find the speeds at both ends of an interval, of the motion near one; differentiable once in all but that."""
-    told = shaking, added, ends
-    return pair.met(ends.side, partial(_behind_rigid, told=told), partial(_behind_soft, told=told, near=near))
+def interval(pair: ImpactPair, excitation: FitExcitation, added: Restitution, ends: Ends, near: Motion) -> Interval:
+    """Compute the speeds at both ends of an interval for the motion near a guess.
+
+    First derivatives are correct in all arguments except `near`.
+    """
+    inputs = excitation, added, ends
+    return pair.by_wall_kind(
+        ends.side, partial(_after_rigid, inputs=inputs), partial(_after_soft, inputs=inputs, near=near)
+    )
 
 
-def guessed_motions(pair: ImpactPair, shaking: Shaking, ends: Ends) -> tuple[Motion, Flag]:
-    """List near what an interval may be: a slow ball may stay long, or enter faster and fly longer.
+def guess_motions(pair: ImpactPair, excitation: FitExcitation, ends: Ends) -> tuple[Motion, Flag]:
+    """Guess the motions of an interval; several motions, from short to long contacts, may take the same time.
 
-    For every duration of the contact its two ends say how fast the ball enters and leaves, and the next impact says
-    how fast it must leave: a function of the duration alone, of which every change of sign is followed.
+    For every contact duration the two ends of the contact determine entry and exit speed, and the next impact
+    determines the exit velocity that is necessary to reach it. The mismatch of the two exit velocities is a function of
+    the duration alone, and every sign change of the mismatch is a guess.
 
     Returns:
-        Guesses [motion], NaN where there are no more; and whether all durations that the interval leaves were tried.
+        Guesses [motion], padded with NaN; and whether contacts as long as the whole interval were searched.
     """
 
     def rigid(_: ImpactPair) -> tuple[Motion, Flag]:
-        # The motion behind a rigid wall is known without a guess.
-        one = jnp.full(_MOTIONS, jnp.nan).at[0].set(1.0)
-        return Motion(one, 0.0 * one), jnp.asarray(True)
+        # At a rigid wall the motion needs no guess, so that one entry is any finite number and all others are NaN.
+        speeds = jnp.full(_MOTIONS, jnp.nan).at[0].set(1.0)
+        return Motion(speeds, 0.0 * speeds), jnp.asarray(True)
 
     def soft(wall: ImpactPair) -> tuple[Motion, Flag]:
         longest = _HALF_TURNS * jnp.pi / flow.membrane(wall, rolled=True).omega1
-        return _crossings(wall, shaking, ends, longest), longest >= ends.next_t - ends.t
+        return _crossings(wall, excitation, ends, longest), longest >= ends.next_t - ends.t
 
-    return pair.met(ends.side, rigid, soft)
+    return pair.by_wall_kind(ends.side, rigid, soft)
 
 
-def _crossings(pair: ImpactPair, shaking: Shaking, ends: Ends, longest: Scalar) -> Motion:
-    """Guess the motions [motion]: where the miss changes its sign from duration to duration, or turns back near 0.
+def _crossings(pair: ImpactPair, excitation: FitExcitation, ends: Ends, longest: Scalar) -> Motion:
+    """Guess the motions [motion] where the mismatch changes its sign on the grid of durations, or turns back near 0.
 
-    Where it turns back two motions may lie closer to each other than the durations; they are those of a parabola.
+    At a turning point near 0 two motions may lie closer together than the grid: a parabola through three points yields
+    both.
     """
     wall = flow.membrane(pair, rolled=True)
     longest = jnp.minimum(longest, ends.next_t - ends.t)
 
-    def stay_at(place: Values) -> Values:
-        # The last leaves room for the shortest flight.
+    def duration_at(place: Values) -> Values:
+        # Durations grow as place^1.5, dense where short; the longest leaves a positive duration to the flight.
         return (jnp.minimum(place, _DURATIONS - _SHORTEST) / _DURATIONS) ** 1.5 * longest
 
     def at(place: Scalar) -> tuple[Scalar, Motion]:
-        """Give the miss, times the impulse response, and the speed that fits both conditions best."""
-        stay = stay_at(place)
-        w, z = shaking.contact(wall, pair.gamma, ends.side, ends.t, jnp.zeros_like(stay), stay)
-        wanted = ends.side * _needed(pair, shaking, ends, ends.t + stay)
-        h, slope = flow.free_response(wall, stay)
+        """Return the mismatch, times the impulse response, and the least-squares entry speed for both conditions."""
+        contact_duration = duration_at(place)
+        w, z = excitation.contact(
+            wall, pair.gamma, ends.side, ends.t, jnp.zeros_like(contact_duration), contact_duration
+        )
+        required_rate = ends.side * _required_velocity(pair, excitation, ends, ends.t + contact_duration)
+        # With entry speed v: w + h v = 0 and z + slope v = required exit rate. Eliminating v gives the mismatch.
+        h, slope = flow.free_response(wall, contact_duration)
         stiff = wall.kappa * wall.kappa
-        speed = (slope * (wanted - z) - stiff * h * w) / (stiff * h * h + slope * slope)
-        return h * (z - wanted) - w * slope, Motion(speed, stay)
+        speed = (slope * (required_rate - z) - stiff * h * w) / (stiff * h * h + slope * slope)
+        return h * (z - required_rate) - w * slope, Motion(speed, contact_duration)
 
     places = 1.0 + jnp.arange(_DURATIONS, dtype=ends.t.dtype)
-    miss, _ = jax.vmap(at)(places)
-    # Of two motions that are close to each other Newton finds one twice, from where neither is much nearer.
-    crosses = miss[:-1] * miss[1:] < 0
-    low, sign = (_first(crosses, values, _CROSSINGS) for values in (places[:-1], jnp.sign(miss[:-1])))
-    crossings = jax.vmap(partial(_halved, lambda place: at(place)[0]))(low, sign)
-    before, here, after = miss[:-2], miss[1:-1], miss[2:]
-    bend, rise = (before + after) / 2 - here, (after - before) / 2
-    turns = (before * here > 0) & (here * after > 0) & (here * bend > 0) & (jnp.abs(rise) <= 2 * jnp.abs(bend))
-    apart = jnp.sqrt(jnp.maximum(rise * rise - 4 * bend * here, 0.0))
-    roots = [places[1:-1] + (-rise + sign * apart) / (2 * bend) for sign in (-1, 1)]
-    found = jnp.concatenate([crossings, *(_first(turns, root, _TURNS) for root in roots)])
-    _, guess = jax.vmap(at)(found)
+    mismatch, _ = jax.vmap(at)(places)
+    # Two motions close together need separate guesses near each; otherwise Newton's method converges to one of them
+    # twice.
+    crosses = mismatch[:-1] * mismatch[1:] < 0
+    low, sign = (_first(crosses, values, _CROSSINGS) for values in (places[:-1], jnp.sign(mismatch[:-1])))
+    crossings = jax.vmap(partial(_bisect, lambda place: at(place)[0]))(low, sign)
+    before, middle, after = mismatch[:-2], mismatch[1:-1], mismatch[2:]
+    # Parabola middle + rise x + bend x^2 through three neighbours, x in grid steps; |rise| <= 2 |bend| puts its vertex
+    # within one step.
+    bend, rise = (before + after) / 2 - middle, (after - before) / 2
+    turns = (before * middle > 0) & (middle * after > 0) & (middle * bend > 0) & (jnp.abs(rise) <= 2 * jnp.abs(bend))
+    root_of_discriminant = jnp.sqrt(jnp.maximum(rise * rise - 4 * bend * middle, 0.0))
+    roots = [places[1:-1] + (-rise + sign * root_of_discriminant) / (2 * bend) for sign in (-1, 1)]
+    all_places = jnp.concatenate([crossings, *(_first(turns, root, _TURNS) for root in roots)])
+    _, guess = jax.vmap(at)(all_places)
     return jax.tree.map(lambda x: jnp.where(guess.speed > 0, x, jnp.nan), guess)
 
 
-def _halved(miss: Callable[[Scalar], Scalar], low: Scalar, sign: Scalar) -> Scalar:
-    """Find where a function that has a sign at `low` changes it before `low` + 1, to a thousandth."""
+def _bisect(mismatch: Callable[[Scalar], Scalar], low: Scalar, sign: Scalar) -> Scalar:
+    """Bisect for the sign change of `mismatch` in `low` to `low` + 1, to a thousandth; `sign` is its sign at `low`."""
 
     def half(k: Array, low: Scalar) -> Scalar:
         middle = low + 0.5 ** (k + 1)
-        return jnp.where(sign * miss(middle) > 0, middle, low)
+        return jnp.where(sign * mismatch(middle) > 0, middle, low)
 
     return lax.fori_loop(0, _HALVINGS, half, low) + 0.5 ** (_HALVINGS + 1)
 
 
 def _first(real: Array, values: Array, count: int) -> Array:
-    """Take the first values that are real; NaN where there are no more."""
+    """Return the first `count` values where `real`, padded with NaN."""
     first = jnp.argsort(~real, stable=True)[:count]
     return jnp.where(real[first], values[first], jnp.nan)
 
 
-def _behind_rigid(pair: ImpactPair, told: tuple[Shaking, Restitution, Ends]) -> Interval:
-    """Leave a rigid wall at once: the flight is known by where it begins and ends."""
-    shaking, added, ends = told
-    out = _needed(pair, shaking, ends, ends.t)
+def _after_rigid(pair: ImpactPair, inputs: tuple[FitExcitation, Restitution, Ends]) -> Interval:
+    """Solve an interval after a rigid wall: the contact takes no time, and the flight follows from its two ends."""
+    excitation, added, ends = inputs
+    out = _required_velocity(pair, excitation, ends, ends.t)
     # -out/speed = r + offset + slope speed, solved for the speed to first order in offset and slope, which are 0.
     plain = -ends.side * out / pair.r
     speed = plain * (1 - (added.offset + added.slope * plain) / pair.r)
     speed = jnp.where(speed > 0, speed, jnp.nan)
-    arrival = shaking.flight(pair.gamma, ends.t, out, ends.next_t - ends.t)[1]
-    return Interval(speed, 0 * speed, arrival, _flown_outside(pair, shaking, ends, ends.t, out))
+    arrival = excitation.flight(pair.gamma, ends.t, out, ends.next_t - ends.t)[1]
+    return Interval(speed, 0 * speed, arrival, _distance_outside(pair, excitation, ends, ends.t, out))
 
 
-def _behind_soft(pair: ImpactPair, told: tuple[Shaking, Restitution, Ends], near: Motion) -> Interval:
-    """Solve for the speed at the onset and the duration of the contact: it ends, and the flight meets the next wall."""
-    frozen, near = lax.stop_gradient(((pair, told), near))
-    x, arrived = _solved(*frozen, near)
-    # The root moves with what the equations are told: its value stays, its first derivatives are right.
-    slopes, here = jax.jacfwd(_followed)(x, *frozen), _followed(x, pair, told)
-    back = solve(slopes.missed, here.missed - lax.stop_gradient(here.missed))
-    out, arrival = here.out - slopes.out @ back, here.arrival - slopes.arrival @ back
-    return _held(pair, told, x - back, here._replace(out=out, arrival=arrival), arrived)
+def _after_soft(pair: ImpactPair, inputs: tuple[FitExcitation, Restitution, Ends], near: Motion) -> Interval:
+    """Solve for entry speed and contact duration, so that the flight reaches the next wall at the given time."""
+    frozen, near = lax.stop_gradient(((pair, inputs), near))
+    x, converged = _solve_contact(*frozen, near)
+    # Implicit function theorem: subtract a Newton step that has the value 0. The root does not change, and its first
+    # derivatives become correct.
+    slopes, response = jax.jacfwd(_response)(x, *frozen), _response(x, pair, inputs)
+    correction = solve(slopes.residual, response.residual - lax.stop_gradient(response.residual))
+    out, arrival = response.out - slopes.out @ correction, response.arrival - slopes.arrival @ correction
+    return _checked_interval(pair, inputs, x - correction, response._replace(out=out, arrival=arrival), converged)
 
 
-def _solved(pair: ImpactPair, told: tuple[Shaking, Restitution, Ends], near: Motion) -> tuple[Float[Array, "2"], Flag]:
-    """Find speed and duration of a contact, from near ones, and say whether they are found."""
-    return _newton(lambda x: _followed(x, pair, told).missed, jnp.stack([near.speed, near.stay]))
+def _solve_contact(
+    pair: ImpactPair, inputs: tuple[FitExcitation, Restitution, Ends], near: Motion
+) -> tuple[Float[Array, "2"], Flag]:
+    """Solve for speed and duration of a contact from a guess, and return whether the solution converged."""
+    return _newton(lambda x: _response(x, pair, inputs).residual, jnp.stack([near.speed, near.contact_duration]))
 
 
-def _held(
-    pair: ImpactPair, told: tuple[Shaking, Restitution, Ends], x: Float[Array, "2"], follows: _Followed, arrived: Flag
+def _checked_interval(
+    pair: ImpactPair,
+    inputs: tuple[FitExcitation, Restitution, Ends],
+    x: Float[Array, "2"],
+    response: _Response,
+    converged: Flag,
 ) -> Interval:
-    """Say all of a contact of this speed and duration and of the flight after it, unless it ends sooner."""
-    shaking, _, ends = told
-    real = arrived & (x[1] <= shaking.longest_contact) & (_shallowest(*lax.stop_gradient((pair, told, x))) > 0)
-    speed, stay, arrival = (jnp.where(real, number, jnp.nan) for number in (x[0], x[1], follows.arrival))
-    return Interval(speed, stay, arrival, _flown_outside(pair, shaking, ends, ends.t + x[1], follows.out))
+    """Return the interval for this contact and the flight after it; NaN if the ball leaves the wall earlier."""
+    excitation, _, ends = inputs
+    real = converged & (x[1] <= excitation.longest_contact) & (_shallowest(*lax.stop_gradient((pair, inputs, x))) > 0)
+    speed, contact_duration, arrival = (jnp.where(real, number, jnp.nan) for number in (x[0], x[1], response.arrival))
+    return Interval(
+        speed, contact_duration, arrival, _distance_outside(pair, excitation, ends, ends.t + x[1], response.out)
+    )
 
 
-def _shallowest(pair: ImpactPair, told: tuple[Shaking, Restitution, Ends], x: Float[Array, "2"]) -> Scalar:
-    """Find the least penetration at a few places of a contact, which is over when the ball first comes back."""
-    shaking, added, ends = told
-    speed, stay = x[0], x[1]
+def _shallowest(pair: ImpactPair, inputs: tuple[FitExcitation, Restitution, Ends], x: Float[Array, "2"]) -> Scalar:
+    """Compute the least penetration at a few places of a contact, which must be positive until the contact ends."""
+    excitation, added, ends = inputs
+    speed, contact_duration = x[0], x[1]
     wall = _membrane(pair, added, speed)
 
     def depth(part: Scalar) -> Scalar:
-        return shaking.contact(wall, pair.gamma, ends.side, ends.t, speed, part * stay)[0]
+        return excitation.contact(wall, pair.gamma, ends.side, ends.t, speed, part * contact_duration)[0]
 
     return jnp.min(jax.vmap(depth)(jnp.asarray(_PLACES)))
 
@@ -228,52 +261,53 @@ def _membrane(pair: ImpactPair, added: Restitution, speed: Scalar) -> flow.Membr
     return flow.membrane(replace(pair, r=pair.r + added.offset + added.slope * speed), rolled=True)
 
 
-def _followed(x: Float[Array, "2"], pair: ImpactPair, told: tuple[Shaking, Restitution, Ends]) -> _Followed:
-    """Follow the ball through the contact and the flight after it."""
-    shaking, added, ends = told
-    speed, stay = x[0], x[1]
-    w, z = shaking.contact(_membrane(pair, added, speed), pair.gamma, ends.side, ends.t, speed, stay)
-    exit_t = ends.t + stay
-    rise, arrival = shaking.flight(pair.gamma, exit_t, ends.side * z, ends.next_t - exit_t)
-    miss = 0.5 * pair.d * (ends.side - ends.next_side) + rise
-    # A penetration has a root at the onset, too.
-    return _Followed(jnp.stack([w / stay, miss]), ends.side * z, arrival)
+def _response(x: Float[Array, "2"], pair: ImpactPair, inputs: tuple[FitExcitation, Restitution, Ends]) -> _Response:
+    """Compute the motion through the contact and the flight after it."""
+    excitation, added, ends = inputs
+    speed, contact_duration = x[0], x[1]
+    w, z = excitation.contact(_membrane(pair, added, speed), pair.gamma, ends.side, ends.t, speed, contact_duration)
+    exit_t = ends.t + contact_duration
+    rise, arrival = excitation.flight(pair.gamma, exit_t, ends.side * z, ends.next_t - exit_t)
+    distance = 0.5 * pair.d * (ends.side - ends.next_side) + rise
+    # Dividing by the duration removes the root of the penetration at the onset.
+    return _Response(jnp.stack([w / contact_duration, distance]), ends.side * z, arrival)
 
 
-def _needed(pair: ImpactPair, shaking: Shaking, ends: Ends, t: Scalar) -> Scalar:
-    """Compute the velocity with which a ball that leaves the first wall at a time meets the next one in time."""
+def _required_velocity(pair: ImpactPair, excitation: FitExcitation, ends: Ends, t: Scalar) -> Scalar:
+    """Compute the velocity that a ball needs at time t at the first wall, to reach the next impact in time."""
     s = ends.next_t - t
-    rise, _ = shaking.flight(pair.gamma, t, jnp.zeros_like(s), s)
+    rise, _ = excitation.flight(pair.gamma, t, jnp.zeros_like(s), s)
     return (0.5 * pair.d * (ends.next_side - ends.side) - rise) / s
 
 
 def _newton(equations: Callable[[Array], Array], x: Float[Array, "2"]) -> tuple[Float[Array, "2"], Flag]:
-    """Solve two equations for two positive numbers; say whether they are solved."""
+    """Solve two equations for two positive numbers by Newton's method, and return whether it converged."""
 
-    def goes_on(carry):
+    def continues(carry):
         count, _, step = carry
-        return (count < _MOST_STEPS) & (step > _ARRIVED)
+        return (count < _MOST_STEPS) & (step > _STEP_TOLERANCE)
 
     def twice(x: Array) -> tuple[Array, Array]:
-        missed = equations(x)
-        return missed, missed  # one to differentiate, one as it is
+        residual = equations(x)
+        return residual, residual  # one to differentiate, one as value
 
-    def go(carry):
+    def iterate(carry):
         count, x, _ = carry
-        slopes, missed = jax.jacfwd(twice, has_aux=True)(x)
-        step = solve(slopes, -missed) / x
+        slopes, residual = jax.jacfwd(twice, has_aux=True)(x)
+        # Relative steps, limited to a half, keep both numbers positive.
+        step = solve(slopes, -residual) / x
         step = jnp.where(jnp.isfinite(step), jnp.clip(step, -_HALF, _HALF), 0.0)
         return count + 1, x * (1 + step), jnp.abs(step).max()
 
-    _, x, step = lax.while_loop(goes_on, go, (0, x, jnp.full_like(x[0], jnp.inf)))
-    return x, (step <= _ARRIVED) & jnp.isfinite(x).all()
+    _, x, step = lax.while_loop(continues, iterate, (0, x, jnp.full_like(x[0], jnp.inf)))
+    return x, (step <= _STEP_TOLERANCE) & jnp.isfinite(x).all()
 
 
-def _flown_outside(pair: ImpactPair, shaking: Shaking, ends: Ends, t: Scalar, out: Scalar) -> Scalar:
-    """Find how far a flight leaves the gap, at a few places."""
-    whole = ends.next_t - t
+def _distance_outside(pair: ImpactPair, excitation: FitExcitation, ends: Ends, t: Scalar, out: Scalar) -> Scalar:
+    """Compute the largest distance of a flight beyond a wall, at a few places."""
+    flight_duration = ends.next_t - t
 
     def place(part: Scalar) -> Scalar:
-        return 0.5 * pair.d * ends.side + shaking.flight(pair.gamma, t, out, part * whole)[0]
+        return 0.5 * pair.d * ends.side + excitation.flight(pair.gamma, t, out, part * flight_duration)[0]
 
     return jnp.max(jnp.abs(jax.vmap(place)(jnp.asarray(_PLACES)))) - 0.5 * pair.d

@@ -1,7 +1,7 @@
-"""What every quantity is called, what it is in and what its values must be: the one table that all others read.
+"""The table of all physical quantities: name, unit, range of values, default, and texts for errors and help.
 
-Begin with `AXES`. Nothing here loads JAX or NumPy until a value is checked, so that help of the command can tell at
-once what its options are.
+All other modules read this table; its main entry is `AXES`, the quantities that a sweep can vary. JAX and NumPy are
+imported only when a value is checked, so that help of the command is fast.
 """
 
 import math
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 
 class Rule(NamedTuple):
-    """What values of a quantity must be, in code, elementwise and false of NaN, and in words."""
+    """Condition on the values of a quantity: an elementwise function, false for NaN, and the text for errors."""
 
     holds: Callable[[Any], Any]
     must: str
@@ -22,25 +22,27 @@ _POSITIVE = Rule(lambda x: (x > 0) & (x < math.inf), "must be positive and finit
 _FINITE = Rule(lambda x: abs(x) < math.inf, "must be finite")
 _NOT_NEGATIVE = Rule(lambda x: (x >= 0) & (x < math.inf), "must be finite and not negative")
 _LIMIT = Rule(lambda x: x > 0, "must be positive")
+# True for every number, NaN included.
 _REAL = Rule(lambda x: (x == x) | (x != x), "must be a real number")
 _PART = Rule(lambda x: (x > 0) & (x <= 1), "must lie in (0, 1]")
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity that may be given: of the pair, of the device, or of the start.
+    """A quantity that can be specified: of the pair, of the device, or of the start.
 
     Attributes:
-        name: What arguments, fields and options call it.
-        text: What it is.
-        rule: What its values must be.
-        unit: What plain numbers of it are in, in SI; "" for a pure number.
-        formula: How a pure number follows from the device, or what it is in units of.
-        symbol: In TeX; its name unless given.
-        alias_of: The constant of the device that it is another name for.
-        default: What it is unless given, as the command would take it or in words.
-        advice: What to do about values that it cannot have, unless to say what it is will do.
-        given_only: Whether it may be given, but is neither tuned nor followed along, as its constant is.
+        name: Name of arguments, fields and options.
+        text: Description.
+        rule: Condition on its values.
+        unit: SI unit of plain numbers; "" for a pure number.
+        formula: Formula of a pure number in terms of the device, or its unit.
+        symbol: Symbol in TeX; default is the name.
+        alias_of: Constant of the device that this quantity determines under another name.
+        default: Default, as the command accepts it or in words.
+        advice: Remedy for values out of range; default is the description with the unit.
+        input_only: True if the quantity can be specified, but neither tuned by an optimiser nor varied by a
+            continuation; its constant can.
     """
 
     name: str
@@ -52,33 +54,34 @@ class Quantity:
     alias_of: str = ""
     default: str = ""
     advice: str = ""
-    given_only: bool = False
+    input_only: bool = False
 
     @property
     def constant(self) -> str:
-        """Name the constant of the device that it decides."""
+        """Return the constant of the device that the quantity determines."""
         return self.alias_of or self.name
 
     @property
     def long_name(self) -> str:
-        """Say what it is, with the formula."""
+        """Return the description with the formula."""
         return f"{self.text}, {self.formula}" if self.formula else self.text
 
     @property
-    def cf(self) -> str:
-        """Write the unit as datasets do: m s-2."""
+    def cf_unit(self) -> str:
+        """Return the unit in the notation of CF datasets, such as m s-2."""
+        # rad/s becomes rad s-1, m/s^2 becomes m s-2; no unit of the table has more than one slash.
         above, _, below = (self.unit or "1").partition("/")
         unit, _, power = below.partition("^")
         return f"{above} {unit}-{power or 1}" if below else above
 
     @property
     def attributes(self) -> dict[str, str]:
-        """Name the attributes of a coordinate of a dataset."""
-        return {"units": self.cf, "long_name": self.long_name, "symbol": self.symbol or self.name}
+        """Return the attributes of a coordinate of a dataset."""
+        return {"units": self.cf_unit, "long_name": self.long_name, "symbol": self.symbol or self.name}
 
     @property
     def remedy(self) -> str:
-        """Say, as an error does, what to do about a value that it cannot have."""
+        """Return the part of an error that states the remedy for a value out of range."""
         return self.advice or f"it is the {self.text} in {self.unit}"
 
 
@@ -87,11 +90,12 @@ def _named(*quantities: Quantity) -> dict[str, Quantity]:
 
 
 START, START_REACH = (0.05853, -0.47898), 0.49
-"""The start unless given, u0 and v0, off the centre of every gap; the displacement is at most this part of the gap."""
+"""Default start (u0, v0), off the centre of every gap; u0 is at most the fraction START_REACH of d."""
 
 FREE_GAP = 2 / math.pi**2
-"""Gap d above which a ball on level ground may fly for ever without an impact, with amplitude 1/pi^2."""
+"""Gap d above which motions without impacts exist at gamma = 0; their amplitude is 1/pi^2."""
 
+# Advice of errors, for values out of range.
 _RIGID = 'a rigid wall is wall="rigid" (kappa=None in an ImpactPair)'
 _GAP = "it is the free travel of the ball in units of A pi^2/omega^2"
 _TRAVEL = "it is the free travel of the ball in m; membranes a distance D apart have s = D - 2 r_b"
@@ -149,7 +153,7 @@ _COMMON = _named(
         formula="s + 2 r_b",
         symbol="D",
         alias_of="s",
-        given_only=True,
+        input_only=True,
     ),
     Quantity(
         "omega0",
@@ -168,7 +172,8 @@ _COMMON = _named(
 SIDES = "left", "right"
 """The two walls, at u = -d/2 and u = d/2."""
 
-_OF_ONE_WALL = {
+# Texts of quantities that each wall has separately; {} becomes left or right.
+_PER_WALL_TEXTS = {
     "kappa": "stiffness of the {} wall",
     "r": "coefficient of restitution of a free contact with the {} wall",
     "omega0": "natural frequency of ball and {} membrane",
@@ -176,16 +181,17 @@ _OF_ONE_WALL = {
 }
 
 
-def _of_one_wall(name: str, side: str) -> Quantity:
-    whole = _COMMON[name]
-    symbol = rf"{whole.symbol or name}^\mathrm{{{side}}}"
-    alias_of = f"{whole.alias_of}_{side}" if whole.alias_of else ""
-    text = _OF_ONE_WALL[name].format(side)
-    return replace(whole, name=f"{name}_{side}", text=text, symbol=symbol, alias_of=alias_of, default="")
+def _per_wall(name: str, side: str) -> Quantity:
+    # An alias refers to the constant of the same wall: kappa_left determines omega0_left.
+    both = _COMMON[name]
+    symbol = rf"{both.symbol or name}^\mathrm{{{side}}}"
+    alias_of = f"{both.alias_of}_{side}" if both.alias_of else ""
+    text = _PER_WALL_TEXTS[name].format(side)
+    return replace(both, name=f"{name}_{side}", text=text, symbol=symbol, alias_of=alias_of, default="")
 
 
-PARAMETERS = _COMMON | _named(*(_of_one_wall(name, side) for name in _OF_ONE_WALL for side in SIDES))
-"""What of pair and device may be an axis; what each wall has of its own last."""
+PARAMETERS = _COMMON | _named(*(_per_wall(name, side) for name in _PER_WALL_TEXTS for side in SIDES))
+"""Quantities of pair and device that can be axes; per-wall quantities come last."""
 
 STARTS = _named(
     Quantity(
@@ -207,7 +213,7 @@ STARTS = _named(
         advice=_AT_REST,
     ),
 )
-"""Where the motion of a cell begins."""
+"""Initial displacement and velocity of a cell."""
 
 AXES = PARAMETERS | STARTS
 """The axes of a sweep."""
@@ -235,9 +241,9 @@ QUANTITIES = AXES | _named(
         advice="1 admits all energy that the impact gives",
     ),
 )
-"""All that may be given by value: the axes, and the constants of the device that are none."""
+"""All quantities that can be specified: the axes, and the other constants and limits of the device."""
 
-GIVEN = QUANTITIES | _named(
+ARGUMENT_QUANTITIES = QUANTITIES | _named(
     Quantity("acceleration", "acceleration of the capsule", _FINITE, "m/s^2"),
     Quantity("damping", "damping over stiffness of a contact", _NOT_NEGATIVE, "s/m"),
     Quantity("angle", "phase of a harmonic", _FINITE, "rad"),
@@ -250,70 +256,75 @@ GIVEN = QUANTITIES | _named(
     Quantity("time", "time", _FINITE, "s"),
     Quantity("velocity", "velocity", _FINITE, formula="in units of A pi / omega", advice=_AT_REST),
 )
-"""All quantities that an argument of a public function may be, whatever the argument is called."""
+"""All quantities that an argument of a public function can have, whatever the name of the argument."""
 
 
 def synonyms(name: str) -> tuple[str, ...]:
-    """Find the axes that decide the same as one does, itself among them: kappa, omega0 and k."""
-    return tuple(one for one, axis in AXES.items() if axis.constant == AXES[name].constant)
+    """Return the axes that determine the same constant as `name`, itself included: kappa, omega0 and k."""
+    return tuple(synonym for synonym, axis in AXES.items() if axis.constant == AXES[name].constant)
 
 
-def parted(name: str) -> tuple[str, str]:
-    """Part the name of what one wall has: ("kappa", "left"); ("d", "") of what both walls share."""
-    whole, _, side = name.rpartition("_")
-    return (whole, side) if side in SIDES else (name, "")
+def split_wall(name: str) -> tuple[str, str]:
+    """Split a per-wall name: ("kappa", "left") for kappa_left; ("d", "") for a quantity of both walls."""
+    base, _, side = name.rpartition("_")
+    # Only the endings left and right name a wall: eps_M and penetration_limit keep their underscores.
+    return (base, side) if side in SIDES else (name, "")
 
 
-def whole(name: str) -> str:
-    """Name a quantity without the wall that it is of: kappa for kappa_left and for kappa."""
-    return parted(name)[0]
+def without_wall(name: str) -> str:
+    """Return the name without the wall: kappa for kappa_left and for kappa."""
+    return split_wall(name)[0]
 
 
-def of_both_walls(name: str) -> str:
-    """Name the axis that gives both walls what this one gives one of them; "" for an axis of the whole."""
-    return whole(name) if parted(name)[1] else ""
+def both_walls_name(name: str) -> str:
+    """Return the axis of both walls for a per-wall axis; "" for any other axis."""
+    return without_wall(name) if split_wall(name)[1] else ""
 
 
 def check(name: str, value: Any, argument: str | None = None) -> None:
-    """Raise unless every element of `value` may be the quantity `name`; traced values pass unseen.
+    """Raise ValueError unless every element of `value` is in the range of quantity `name`; traced values pass.
 
     Args:
-        name: Of the quantity.
+        name: Name of the quantity.
         value: A number or an array.
-        argument: What an error speaks of, unless it is called as the quantity is.
+        argument: Name that an error uses; default is `name`.
 
     Raises:
         ValueError: "r must lie in (0, 1]; got -0.2 at index (3, 7); an elastic wall is r = 1".
 
     Warns:
-        UserWarning: An inclination beyond pi/2, as degrees taken for rad.
+        UserWarning: For an inclination beyond pi/2, which suggests degrees instead of rad.
     """
-    import numpy as np  # here, as the table must not load it
+    import numpy as np  # not at the top: importing the table must not load NumPy
 
-    from vijax.runtime import checks
+    from vijax.runtime import validation
 
-    if not checks.is_concrete(value):
+    if not validation.is_concrete(value):
         return
-    quantity, called = GIVEN[name], argument or name
-    array = checks.numbers(called, value, quantity.remedy)
+    quantity, called = ARGUMENT_QUANTITIES[name], argument or name
+    array = validation.validate_numbers(called, value, quantity.remedy)
+    # Rules are False for NaN, so that NaN is reported as a value out of range.
     good = quantity.rule.holds(array)
     if not np.all(good):
-        raise ValueError(f"{called} {quantity.rule.must}; got {checks.first(array, good)}; {quantity.remedy}")
+        raise ValueError(
+            f"{called} {quantity.rule.must}; got {validation.first_invalid(array, good)}; {quantity.remedy}"
+        )
+    # Inclinations are periodic, hence valid; only the likely mistake is reported.
     if name == "beta" and (steepest := np.abs(array).max()) > 0.5 * math.pi:
         advice = "20 degrees are 20deg on the command line, and numpy.deg2rad(20) in Python"
         warnings.warn(f"{called} is up to {steepest:.6g} rad, which is beyond pi/2; {advice}", stacklevel=2)
 
 
-# --- what is measured ------------------------------------------------------------------------------------------------
+# --- results -------------------------------------------------------------------------------------------------------
 
 
-class Measured(NamedTuple):
-    """What is measured of impacts and orbits, whatever records it.
+class ResultQuantity(NamedTuple):
+    """A result quantity of impacts and orbits.
 
     Attributes:
-        units: As datasets write them.
-        text: What it is, for datasets.
-        label: What a picture writes at its axis.
+        units: Unit, in the notation of datasets.
+        text: Description, for datasets.
+        label: Axis label of a picture.
     """
 
     units: str
@@ -322,31 +333,33 @@ class Measured(NamedTuple):
 
     @property
     def attributes(self) -> dict[str, str]:
-        """Name the attributes of a variable of a dataset."""
+        """Return the attributes of a variable of a dataset."""
         return {"units": self.units, "long_name": self.text}
 
 
-MEASURED = {
-    "v_in": Measured(
+RESULT_QUANTITIES = {
+    "v_in": ResultQuantity(
         "1", "velocity at the onset, in units of A pi / omega", r"$v_\mathrm{in}$, velocity at the impact"
     ),
-    "v_out": Measured(
+    "v_out": ResultQuantity(
         "1", "velocity at the exit, in units of A pi / omega", r"$v_\mathrm{out}$, velocity after the impact"
     ),
-    "restitution": Measured("1", "-v_out / v_in", r"$-v_\mathrm{out} / v_\mathrm{in}$, effective restitution"),
-    "phase": Measured("1", "phase of the onset, in half forcing periods", "phase of the impact [half forcing periods]"),
-    "duration": Measured(
+    "restitution": ResultQuantity("1", "-v_out / v_in", r"$-v_\mathrm{out} / v_\mathrm{in}$, effective restitution"),
+    "phase": ResultQuantity(
+        "1", "phase of the onset, in half forcing periods", "phase of the impact [half forcing periods]"
+    ),
+    "duration": ResultQuantity(
         "1", "duration of the contact, in half forcing periods", "duration of the contact [half forcing periods]"
     ),
-    "depth": Measured("m", "penetration of the membrane", "penetration [m]"),
-    "E": Measured("J", "energy harvested from the impact", r"$E_j$, energy of the impact [J]"),
-    "P": Measured("J", "energy harvested per half forcing period", "$P$ [J per half period]"),
-    "u_strobe": Measured("1", "displacement at phase 0, in units of A pi^2 / omega^2", "$u$ at phase 0"),
-    "v_strobe": Measured("1", "velocity at phase 0, in units of A pi / omega", r"$\dot{u}$ at phase 0"),
-    "multiplier": Measured("1", "largest modulus of a Floquet multiplier", "largest modulus of a multiplier"),
-    "side": Measured("1", "wall: -1 left, 1 right"),
+    "depth": ResultQuantity("m", "penetration of the membrane", "penetration [m]"),
+    "E": ResultQuantity("J", "energy harvested from the impact", r"$E_j$, energy of the impact [J]"),
+    "P": ResultQuantity("J", "energy harvested per half forcing period", "$P$ [J per half period]"),
+    "u_strobe": ResultQuantity("1", "displacement at phase 0, in units of A pi^2 / omega^2", "$u$ at phase 0"),
+    "v_strobe": ResultQuantity("1", "velocity at phase 0, in units of A pi / omega", r"$\dot{u}$ at phase 0"),
+    "multiplier": ResultQuantity("1", "largest modulus of a Floquet multiplier", "largest modulus of a multiplier"),
+    "side": ResultQuantity("1", "wall: -1 left, 1 right"),
 }
 POINT_QUANTITIES = ("v_in", "v_out", "restitution", "phase", "duration", "depth", "E", "P", "u_strobe", "v_strobe")
-"""What a picture of an orbit diagram may show."""
+"""Quantities that a picture of an orbit diagram can show."""
 BRANCH_QUANTITIES = ("v_in", "phase", "duration", "depth", "P", "multiplier")
-"""What a picture of branches may show."""
+"""Quantities that a picture of branches can show."""

@@ -1,4 +1,4 @@
-"""What decides that an orbit is lost: there is none any more, it is not real, or it does not attract."""
+"""Validity of an orbit: whether it exists, can be followed by the ball, and attracts nearby motions."""
 
 from typing import NamedTuple
 
@@ -8,50 +8,58 @@ from jaxtyping import Array, Float, Int
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
 from vijax.orbits import multipliers
-from vijax.orbits.grazing import Between, between
-from vijax.orbits.shooting import Departure, Knots, Sequence
+from vijax.orbits.clearances import InteriorMotion, interior_motion
+from vijax.orbits.shooting import ContactExits, ImpactUnknowns, Sequence
 
-_CONVERGED = 1e-10  # residual of an orbit's equations: where Newton converged, it is near rounding
-# Nearer than this to |multiplier| = 1 an orbit is at its bifurcation, and derivatives have lost half of their digits.
+_CONVERGED = 1e-10  # largest residual of a converged orbit; residuals after convergence are near rounding, far below
+# An orbit with a multiplier this close to the unit circle counts as at a bifurcation. Its derivatives have lost half of
+# their digits, because the condition number of I - DP (DP: monodromy matrix) is about the inverse of the distance.
 _MARGIN = 1e-7
 
 
 class Validity(NamedTuple):
-    """Whether an orbit is one, and by how much.
+    """Status of a solution of the shooting equations, and the numbers that determine it.
 
     Attributes:
-        status: OK; NO_ORBIT: the equations are not met; VIRTUAL: the ball would meet a wall in between; UNSTABLE: it
-            repels, or is at a bifurcation. The first of these that holds.
+        status: The first of these that holds: NO_ORBIT, the equations do not hold; VIRTUAL, the ball would hit a wall
+            between two impacts; UNSTABLE, the orbit repels or is at a bifurcation; OK.
         multiplier: Largest modulus of the Floquet multipliers of the full orbit.
-        condition: Condition number of I - DP, Frobenius.
-        motion: Clearances, and when each contact is deepest.
+        condition: Condition number of I - DP in the Frobenius norm, with the monodromy matrix DP.
+        motion: Clearances, and the time of the deepest point of each contact.
     """
 
     status: Int[Array, ""]
     multiplier: Float[Array, ""]
     condition: Float[Array, ""]
-    motion: Between
+    motion: InteriorMotion
 
 
 def validity(
-    pair: ImpactPair, sequence: Sequence, knots: Knots, residual: Float[Array, ""], departure: Departure
+    pair: ImpactPair,
+    sequence: Sequence,
+    impact_unknowns: ImpactUnknowns,
+    residual: Float[Array, ""],
+    exits: ContactExits,
 ) -> Validity:
-    """Judge an orbit by what is left of its equations, its clearances and its multipliers.
+    """Compute status and margins of an orbit from the residual of its equations, its clearances and its multipliers.
 
     Args:
-        pair, sequence, knots: The orbit.
-        residual: Its largest violation of the equations.
-        departure: How its contacts end.
+        pair, sequence, impact_unknowns: The orbit.
+        residual: Largest absolute residual of the shooting equations.
+        exits: The ends of the contacts.
     """
-    around = multipliers.monodromy(pair, sequence, knots)
+    around = multipliers.monodromy(pair, sequence, impact_unknowns)
     multiplier = jnp.abs(multipliers.floquet(around[None], sequence.mirrored[None])).max()
-    away = jnp.eye(2, dtype=knots.dtype) - around
-    condition = (away * away).sum() / jnp.abs(away[0, 0] * away[1, 1] - away[0, 1] * away[1, 0])
-    motion = between(pair, sequence, knots, departure)
-    found = residual < _CONVERGED
-    real = jnp.stack(motion.clearance).min() > 0
+    difference = jnp.eye(2, dtype=impact_unknowns.dtype) - around
+    # For a 2 x 2 matrix ||A||_F ||A^-1||_F = ||A||_F^2 / |det A|.
+    condition = (difference * difference).sum() / jnp.abs(
+        difference[0, 0] * difference[1, 1] - difference[0, 1] * difference[1, 0]
+    )
+    motion = interior_motion(pair, sequence, impact_unknowns, exits)
+    is_converged = residual < _CONVERGED
+    is_real = jnp.stack(motion.clearance).min() > 0
     attracts = multiplier < 1 - _MARGIN
     status = jnp.where(attracts, Status.OK, Status.UNSTABLE)
-    status = jnp.where(real, status, Status.VIRTUAL)
-    status = jnp.where(found, status, Status.NO_ORBIT).astype(jnp.int32)
+    status = jnp.where(is_real, status, Status.VIRTUAL)
+    status = jnp.where(is_converged, status, Status.NO_ORBIT).astype(jnp.int32)
     return Validity(status, multiplier, condition, motion)

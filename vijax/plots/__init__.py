@@ -1,12 +1,12 @@
-"""Pictures of maps, orbit diagrams, branches and designs: the only folder that imports matplotlib.
+"""Pictures of maps, orbit diagrams, branches, curves and designs; no other folder imports matplotlib.
 
-`style` knows before a run what can be drawn, and loads none of it. Begin with `number_maps`.
+`style` checks before a run whether a picture can be drawn, without importing matplotlib. Begin with `number_maps`.
 """
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vijax.runtime.offered import homes, load
+from vijax.runtime.lazy_imports import load, name_locations
 
 if TYPE_CHECKING:
     from vijax.plots.branch_diagrams import branches
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from vijax.plots.orbit_diagrams import orbit_diagram
     from vijax.plots.responses import response
 else:
-    _HOMES = homes(__name__, Path(__file__))
+    _MODULES = name_locations(__name__, Path(__file__))
 
     def __getattr__(name: str) -> Any:
-        if name not in _HOMES:
+        if name not in _MODULES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return load(_HOMES[name])
+        return load(_MODULES[name])
 
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""A map as colours of its cells, marks and a legend, in numbers: what a screen draws that is not matplotlib's."""
+"""Cell colours, marks and legend of a map as plain numbers, for a page that does not draw with matplotlib."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,11 +8,11 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.colors import LogNorm, Normalize, to_hex, to_rgba, to_rgba_array
 
+from vijax.maps.map_dataset import best
 from vijax.model.records import Status
-from vijax.planes.dataset import best
 from vijax.plots.cells import BARE, borders, edges, marked_places
 from vijax.plots.kind_maps import Category, of_flags, of_labels, table_colours
-from vijax.plots.number_maps import POWER, Mark, has_colour, kind_of
+from vijax.plots.number_maps import POWER, Marker, has_colour, kind_of
 from vijax.plots.style import NEEDS, is_kind
 
 if TYPE_CHECKING:
@@ -25,9 +25,9 @@ class LegendEntry:
 
     Attributes:
         sign: "cell", "veil", "border", "dot", "cross" or "star".
-        colour: As hexadecimal digits after a hash.
-        text: What it means.
-        count: Of cells.
+        colour: Hexadecimal digits after a hash.
+        text: Meaning of the sign.
+        count: Number of cells.
     """
 
     sign: str
@@ -38,19 +38,19 @@ class LegendEntry:
 
 @dataclass(frozen=True)
 class ColouredMap:
-    """What a screen draws of a map.
+    """The parts of a map that a screen draws.
 
     Attributes:
-        colours: Red, green, blue and opacity of every cell, of bytes [y, x, 4].
-        span: What the colours of numbers span; None of kinds.
-        log: Whether these are logarithmic.
-        title: What is coloured, with its unit.
-        palette: Of numbers, as hexadecimal digits.
-        veiled: Whether a cell is veiled, as its numbers are not to be believed, [y, x].
-        segments: Of the border of period 1, [segment, (x0, y0, x1, y1)].
-        dots, crosses: Places of aperiodic and of undecided cells, each [x or y, mark].
-        star: Where the largest admissible P is.
-        legend: Of all these.
+        colours: Red, green, blue and opacity of every cell as bytes, [y, x, 4].
+        span: Least and largest number of the colour scale; None for a map of kinds (labels or flags).
+        log: Whether the colour scale is logarithmic.
+        title: Coloured quantity with its unit.
+        palette: Colours of the scale as hexadecimal digits.
+        veiled: Whether a cell is veiled, because its numbers are not admissible, [y, x].
+        segments: Border of the cells of period 1, [segment, (x0, y0, x1, y1)].
+        dots, crosses: Positions of aperiodic and of undecided cells, each [x or y, mark].
+        star: Position of the largest admissible P.
+        legend: Lines of the legend.
     """
 
     colours: np.ndarray
@@ -67,18 +67,18 @@ class ColouredMap:
 
 
 def coloured(dataset: "xr.Dataset", name: str, x: str, y: str, log: bool | None = None) -> ColouredMap:
-    """Colour the cells of a map over two axes as the functions of this folder do.
+    """Return the coloured cells of a map over two axes, with the colours that the pictures of this folder have.
 
     Args:
-        dataset: Over x and y alone, ascending.
-        name: Of the variable, or "label".
+        dataset: Map over x and y alone, ascending.
+        name: Name of the variable, or "label".
         x, y: Names of the axes.
-        log: Whether colours of numbers are logarithmic; as the pictures have it unless given.
+        log: Whether the colour scale is logarithmic; by default as in the pictures by matplotlib.
     """
-    like = dataset["status"].transpose(y, x, ...) if name == "label" else dataset[name]
+    variable = dataset["status"].transpose(y, x, ...) if name == "label" else dataset[name]
     cells = dataset["status"]
     dataset = dataset.assign({key: value.broadcast_like(cells).transpose(y, x) for key, value in dataset.items()})
-    if name == "label" or is_kind(like):
+    if name == "label" or is_kind(variable):
         return _of_kinds(dataset, name, x, y)
     return _of_numbers(dataset, name, x, y, log)
 
@@ -86,20 +86,20 @@ def coloured(dataset: "xr.Dataset", name: str, x: str, y: str, log: bool | None 
 def _of_kinds(dataset: "xr.Dataset", name: str, x: str, y: str) -> ColouredMap:
     drawn, categories = of_labels(dataset) if name == "label" else of_flags(dataset, name)
     codes = drawn["code"].transpose(y, x).values
-    shades = to_rgba_array([one.colour for one in categories])
+    shades = to_rgba_array([category.colour for category in categories])
     counts = np.bincount(codes.ravel(), minlength=len(categories))
     legend = tuple(
-        LegendEntry("cell", to_hex(one.colour), _without_share(one), int(count))
-        for one, count in zip(categories, counts, strict=True)
+        LegendEntry("cell", to_hex(category.colour), _without_share(category), int(count))
+        for category, count in zip(categories, counts, strict=True)
     )
-    nothing = np.zeros(codes.shape, bool)
+    no_veil = np.zeros(codes.shape, bool)
     return ColouredMap(
         colours=_bytes(shades[codes]),
         span=None,
         log=False,
         title="label" if name == "label" else name.replace("_", " "),
         palette=(),
-        veiled=nothing,
+        veiled=no_veil,
         segments=np.empty((0, 4)),
         dots=np.empty((2, 0)),
         crosses=np.empty((2, 0)),
@@ -109,7 +109,7 @@ def _of_kinds(dataset: "xr.Dataset", name: str, x: str, y: str) -> ColouredMap:
 
 
 def _without_share(category: Category) -> str:
-    """Leave out the share that stands before the name: here is a count."""
+    """Return a category's name without its leading share; a legend entry has the count instead."""
     return category.text.partition(" % ")[2]
 
 
@@ -119,20 +119,21 @@ def _of_numbers(dataset: "xr.Dataset", name: str, x: str, y: str, log: bool | No
     power = name == "P" and set(NEEDS) <= set(map(str, dataset.data_vars))
     kind = POWER if power else kind_of(dataset, name)
     norm = _scaled(kind.colours(dataset), log, dataset[name].values)
+    # Infinities become the largest number, which takes the top colour instead of the colour of missing values.
     values = np.minimum(dataset[name].values.astype(float), np.finfo(float).max)
-    shown = has_colour(values, norm) & ~np.isnan(values)
-    colours = np.asarray(mpl.colormaps["viridis"](norm(np.where(shown, values, norm.vmin))))
-    colours[~shown] = to_rgba(BARE["color"])
-    run = dataset["status"].values != Status.NOT_RUN
-    marks = [mark._replace(mask=mark.mask & run) for mark in kind.marks(dataset)]
-    found = _marked(marks, dataset, x, y)
+    visible = has_colour(values, norm) & ~np.isnan(values)
+    colours = np.asarray(mpl.colormaps["viridis"](norm(np.where(visible, values, norm.vmin))))
+    colours[~visible] = to_rgba(BARE["color"])
+    was_run = dataset["status"].values != Status.NOT_RUN
+    markers = [marker._replace(mask=marker.mask & was_run) for marker in kind.markers(dataset)]
+    layout = _marked(markers, dataset, x, y)
     peak = best(dataset) if {"P", "admissible"} <= set(map(str, dataset.data_vars)) else None
     star = None if peak is None else (float(peak[x]), float(peak[y]))
-    legend = [_entry(mark) for mark in marks if mark.mask.any()]
+    legend = [_entry(marker) for marker in markers if marker.mask.any()]
     if peak is not None:
         legend.append(LegendEntry("star", "#d62728", f"largest admissible P, {float(peak):.4g} J", 1))
     return replace(
-        found,
+        layout,
         colours=_bytes(colours),
         span=(float(norm.vmin or 0.0), float(norm.vmax or 1.0)),
         log=isinstance(norm, LogNorm),
@@ -144,7 +145,7 @@ def _of_numbers(dataset: "xr.Dataset", name: str, x: str, y: str, log: bool | No
 
 
 def _scaled(norm: Normalize, log: bool | None, values: np.ndarray) -> Normalize:
-    """Put a scale of colours in place of the picture's own, if another is wanted and can be."""
+    """Replace a colour scale by a logarithmic or a linear one, if one is requested and possible."""
     if log is None or log == isinstance(norm, LogNorm):
         return norm
     if not log:
@@ -153,20 +154,20 @@ def _scaled(norm: Normalize, log: bool | None, values: np.ndarray) -> Normalize:
     return LogNorm(positive.min(), max(positive.max(), 1.001 * positive.min())) if positive.size else norm
 
 
-def _marked(marks: list[Mark], dataset: "xr.Dataset", x: str, y: str) -> ColouredMap:
-    """Lay out the marks of a map of numbers; its colours are yet to come."""
+def _marked(markers: list[Marker], dataset: "xr.Dataset", x: str, y: str) -> ColouredMap:
+    """Return a `ColouredMap` that holds the marks of a map of numbers; its colours are still empty."""
     across, up = (dataset[name].values for name in (x, y))
     shape = (up.size, across.size)
     veiled, segments = np.zeros(shape, bool), np.empty((0, 4))
-    places = {how: np.empty((2, 0)) for how in ("most", "any")}
-    for mark in marks:
-        if mark.how == "veil":
-            veiled = mark.mask
-        elif mark.how == "border":
-            lines = borders(edges(across)[0], edges(up)[0], mark.mask)
-            segments = np.array([(*one, *other) for one, other in lines]).reshape(-1, 4)
-        elif mark.how in places:
-            places[mark.how] = np.array(marked_places(mark.mask, across, up, most=mark.how == "most"))
+    positions = {how: np.empty((2, 0)) for how in ("most", "any")}
+    for marker in markers:
+        if marker.how == "veil":
+            veiled = marker.mask
+        elif marker.how == "border":
+            lines = borders(edges(across)[0], edges(up)[0], marker.mask)
+            segments = np.array([(*begin, *end) for begin, end in lines]).reshape(-1, 4)
+        elif marker.how in positions:
+            positions[marker.how] = np.array(marked_places(marker.mask, across, up, most=marker.how == "most"))
     return ColouredMap(
         colours=np.empty((*shape, 4), np.uint8),
         span=None,
@@ -175,8 +176,8 @@ def _marked(marks: list[Mark], dataset: "xr.Dataset", x: str, y: str) -> Coloure
         palette=(),
         veiled=veiled,
         segments=segments,
-        dots=places["most"],
-        crosses=places["any"],
+        dots=positions["most"],
+        crosses=positions["any"],
         star=None,
         legend=(),
     )
@@ -185,11 +186,11 @@ def _marked(marks: list[Mark], dataset: "xr.Dataset", x: str, y: str) -> Coloure
 _SIGNS = {"veil": "veil", "border": "border", "most": "dot", "any": "cross", "bare": "cell"}
 
 
-def _entry(mark: Mark) -> LegendEntry:
+def _entry(marker: Marker) -> LegendEntry:
     colour = {"veil": "#4d4d4d", "border": "#ffffff", "most": "#000000", "any": "#ff0000"}.get(
-        mark.how, to_hex(BARE["color"])
+        marker.how, to_hex(BARE["color"])
     )
-    return LegendEntry(_SIGNS[mark.how], colour, mark.text, int(mark.mask.sum()))
+    return LegendEntry(_SIGNS[marker.how], colour, marker.text, int(marker.mask.sum()))
 
 
 def _bytes(colours: np.ndarray) -> np.ndarray:
@@ -197,5 +198,5 @@ def _bytes(colours: np.ndarray) -> np.ndarray:
 
 
 def attractor_colours(labels: Sequence[str]) -> list[str]:
-    """Give the colours of attractors by their place in a table, as `basins` draws them."""
+    """Return the colours of attractors by their row in a table, as `basins` draws them."""
     return [to_hex(colour) for colour in table_colours(labels)]

@@ -1,4 +1,4 @@
-"""Where every picture begins and ends: drawn in one style, saved whole and with a mark."""
+"""Style and saving of every picture: one style, files written completely or not at all, with a mark in the metadata."""
 
 import functools
 from collections.abc import Callable
@@ -12,27 +12,27 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullLocator
 
 from vijax.plots.style import STYLE, save_figure
-from vijax.runtime import checks
+from vijax.runtime import validation
 
 P = ParamSpec("P")
 
-_FEW_DECADES = 1.6  # up to which 1, 2 and 5 of a decade are labelled, as its powers alone are too few
-_BARELY = 0.7  # decades; below, even 1, 2 and 5 are too few, and round numbers are labelled as on a linear axis
+_FEW_DECADES = 1.6  # shorter axes, in decades, have labels at 1, 2 and 5 times powers of ten
+_BARELY = 0.7  # still shorter axes, in decades, have labels at round numbers as a linear axis has
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Mark what makes a figure: it does so in the style of all pictures, whatever matplotlib is set to outside."""
+    """Decorate a function that makes a figure: it draws in the common style, independent of matplotlib's settings."""
 
     @functools.wraps(draw)
-    def draws(*args: P.args, **kwargs: P.kwargs) -> Figure:
+    def draw_in_style(*args: P.args, **kwargs: P.kwargs) -> Figure:
         with mpl.rc_context(STYLE):
             return draw(*args, **kwargs)
 
-    return draws
+    return draw_in_style
 
 
 def label_logs(axes: Axes) -> None:
-    """Label logarithmic axes of few decades by plain numbers; matplotlib writes 2 x 10^1, 3 x 10^1 over each other."""
+    """Label logarithmic axes of few decades by plain numbers; matplotlib's 2 x 10^1, 3 x 10^1 would overlap."""
     for axis in (axes.xaxis, axes.yaxis):
         decades = float(np.ptp(np.log10(axis.get_view_interval()))) if axis.get_scale() == "log" else np.inf
         if decades < _FEW_DECADES:
@@ -42,17 +42,17 @@ def label_logs(axes: Axes) -> None:
 
 
 def save(figure: Figure, path: str | Path) -> None:
-    """Save a figure of this folder as a file that is whole or absent, and says that vijax drew it.
+    """Save a figure of this folder; the file is written completely or not at all, and marked as drawn by vijax.
 
     Args:
-        figure: What a function of `vijax.plots` returned; it may have been changed since.
-        path: Where to; .png, .pdf, .svg or .eps chooses the format. What is there is replaced.
+        figure: Result of a function of `vijax.plots`; it may have been changed since.
+        path: Path of the file; its ending .png, .pdf, .svg or .eps selects the format. An existing file is replaced.
 
     Raises:
-        ValueError: Another ending.
-        OSError: If it cannot be written; what was there stays.
+        ValueError: The path has another ending.
+        OSError: The file cannot be written; an existing file is unchanged.
     """
-    checks.instance("figure", figure, Figure, "a function of vijax.plots")
-    # Fonts, hatches and dots an inch count as it is written, too.
+    validation.validate_instance("figure", figure, Figure, "a function of vijax.plots")
+    # Fonts, hatches and resolution take effect when the file is written, so the style applies here as well.
     with mpl.rc_context(STYLE):
         save_figure(figure, path)

@@ -1,4 +1,4 @@
-"""Maps coloured by a number, P before all, with what tells where to believe it."""
+"""Maps coloured by a number, above all P, with marks that show where the number is admissible."""
 
 from collections.abc import Callable
 from functools import partial
@@ -14,22 +14,22 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.ticker import EngFormatter
 
-from vijax.planes.compare import Label, Model
-from vijax.planes.dataset import best
+from vijax.maps.compare import CheapestModel, LabelAgreement
+from vijax.maps.map_dataset import best
 from vijax.plots.cells import BARE, VEIL, borders, edges, marked_places, numbered, panels, runs, veil
 from vijax.plots.figure import label_logs, styled
 from vijax.plots.kind_maps import coded, of_flags
 from vijax.plots.style import EXPECTED_NEEDS, NEEDS, QUANTITIES, axis_label, is_kind, layout, title, units
-from vijax.runtime import checks
+from vijax.runtime import validation
 
 if TYPE_CHECKING:
     import xarray as xr
 
-# A wider scale would say more about its faintest cells than about those worth building.
+# Decades of colours below the largest number: a wider scale would resolve the weakest cells, not the useful ones.
 _DECADES = 4
-_ALL_DECADES = 8  # where inadmissible cells are shown too
-_ENOUGH = 0.1  # a smaller share of admissible cells among those shown does not choose the colours
-_WIDE = 30  # ratio of the largest to the smallest number from which on their scale is logarithmic
+_ALL_DECADES = 8  # decades if the colours span inadmissible cells too
+_ENOUGH = 0.1  # least fraction of admissible cells if the colours are to span these cells alone
+_WIDE = 30  # ratio of the largest to the smallest number above which their scale is logarithmic
 
 
 _LINE: dict[str, Any] = {
@@ -40,12 +40,20 @@ _LINE: dict[str, Any] = {
 _DOT: dict[str, Any] = {"marker": ".", "markersize": 1.3, "color": "black", "mew": 0, "linestyle": "none"}
 _CROSS: dict[str, Any] = {"marker": "x", "markersize": 3.0, "color": "red", "mew": 0.7, "linestyle": "none"}
 _OUTLINE: dict[str, Any] = _LINE | {"color": "red", "linewidth": 1.2}
-_SINGLE = {"markersize": 4.0}  # a mark that is not one of thousands may be larger
+_SINGLE = {"markersize": 4.0}  # larger size for a mark that is not one of thousands
 _STAR: dict[str, Any] = {"marker": "*", "markersize": 11, "color": "red", "mec": "white", "linestyle": "none"}
 
 
-class Mark(NamedTuple):
-    """Cells that carry a mark, and what it means: a veil, the border around them, a point on most or any, or none."""
+class Marker(NamedTuple):
+    """Cells of a map with a common mark.
+
+    Attributes:
+        mask: The marked cells, [y, x].
+        how: Kind of mark: "veil" over the cells, "border" around them, points on blocks of cells with "most" or with
+            "any" cells in the mask, or "bare" for cells that have no colour and get no mark.
+        style: Keyword arguments of matplotlib.
+        text: Text of the mark in the legend.
+    """
 
     mask: np.ndarray
     how: Literal["veil", "border", "most", "any", "bare"]
@@ -54,69 +62,75 @@ class Mark(NamedTuple):
 
 
 class MapKind(NamedTuple):
-    """A kind of picture: what it colours and how, which function makes such maps, the variables that it needs.
+    """A kind of picture.
 
-    And those that it can do without, its marks.
+    Attributes:
+        coloured: Name of the coloured variable.
+        label: Label of the colour bar.
+        producer: Function that makes such maps.
+        needs: Required variables.
+        optional: Variables of the marks, used if present.
+        colours: Returns the colour scale of a dataset.
+        markers: Returns the marks of a dataset.
     """
 
     coloured: str
     label: str
-    made: str
+    producer: str
     needs: tuple[str, ...]
     optional: tuple[str, ...]
     colours: "Callable[[xr.Dataset], Normalize]"
-    marks: "Callable[[xr.Dataset], list[Mark]]"
+    markers: "Callable[[xr.Dataset], list[Marker]]"
 
 
 @styled
 def power_map(dataset: "xr.Dataset") -> Figure:
-    """Draw P on a log colour scale, with all that tells where to believe it.
+    """Draw P on a logarithmic colour scale, with marks that show where P is admissible.
 
     Inadmissible cells are veiled and hatched, the border of the period-1 region is a line, aperiodic cells carry dots
     and undecided ones crosses, and a star stands on the largest admissible P. The colours span the admissible cells if
-    these are a tenth of those shown, and otherwise all.
+    they are at least a tenth of the drawn cells, otherwise all drawn cells.
 
-    Of a map with several starts in every cell it is the P expected of them; a line then goes around cells of more than
-    one attractor, crosses stand where starts were left undecided, and cells are veiled that any start makes
-    inadmissible.
+    A map with several starts in every cell shows the expected P. A line then surrounds cells with more than one
+    attractor, crosses stand where starts remained undecided, and cells that any start makes inadmissible are veiled.
 
     Args:
         dataset: A map with `P`, `period` and `admissible`. Its dimensions are, in order, x, y, columns and rows of
-            panels; of one dimension a curve is drawn.
+            panels; with one dimension a curve is drawn.
 
     Raises:
-        ValueError: If the map lacks a variable, or has more dimensions or panels than a picture can hold.
+        ValueError: The map lacks a variable, or has more dimensions or panels than a picture can hold.
     """
-    checks.variables("dataset", dataset, (), "sweep")
+    validation.validate_dataset("dataset", dataset, (), "sweep")
     return _picture(dataset, _EXPECTED if "starts" in dataset.attrs else POWER)
 
 
 @styled
 def variable_map(dataset: "xr.Dataset", name: str) -> Figure:
-    """Draw any variable of a map, with the marks of `power_map` for as much as the map holds.
+    """Draw any variable of a map, with the marks of `power_map` that the map's variables allow.
 
-    Numbers are coloured, on a log scale where they are positive and span a factor of 30; what is a kind, such as
-    `status` or `admissible`, has a colour each. Cells without a value are grey.
+    Numbers are coloured, on a logarithmic scale if they are positive and span a factor of 30. A kind, such as `status`
+    or `admissible`, has one colour per value. Cells without a value are grey.
 
     Args:
-        dataset: What `sweep` returned; dimensions as in `power_map`, for kinds two at least.
-        name: Of the variable.
+        dataset: Result of `sweep`; dimensions as in `power_map`, for kinds at least two.
+        name: Name of the variable.
 
     Raises:
         ValueError: As `power_map`.
     """
-    checks.variables("dataset", dataset, (), "sweep")
-    checks.choice("name", name, [str(one) for one in dataset])
+    validation.validate_dataset("dataset", dataset, (), "sweep")
+    validation.validate_choice("name", name, [str(variable_name) for variable_name in dataset])
     variable = dataset[name]
     if is_kind(variable):
         return coded(*of_flags(dataset, name))
     if variable.dtype.kind == "i":
-        dataset = dataset.assign({name: variable.where(variable >= 0)})  # -1 is none
+        dataset = dataset.assign({name: variable.where(variable >= 0)})  # -1 means no value
     return _picture(dataset, kind_of(dataset, name))
 
 
 def kind_of(dataset: "xr.Dataset", name: str) -> MapKind:
-    """Say how a variable of numbers is coloured and what marks it has, as `variable_map` draws it."""
+    """Return the colours and marks of a variable of numbers, as `variable_map` draws it."""
     variable = dataset[name]
     written = name.replace("_", " ") + (f" [{units(variable)}]" if units(variable) else "")
     return MapKind(
@@ -126,19 +140,19 @@ def kind_of(dataset: "xr.Dataset", name: str) -> MapKind:
         (name,),
         (*NEEDS, *EXPECTED_NEEDS),
         partial(_number_colours, name),
-        partial(_number_marks, name),
+        partial(_number_markers, name),
     )
 
 
 @styled
 def difference_map(dataset: "xr.Dataset") -> Figure:
-    """Draw the relative difference in P between rigid and soft walls on a log colour scale.
+    """Draw the relative difference in P between rigid and soft walls on a logarithmic colour scale.
 
-    A line parts cells whose labels differ from the others; another one, where the comparison was given a tolerance,
-    goes around the cells where the rigid model is enough, and crosses stand on those without a verdict.
+    A line separates cells with different labels from the others. If the comparison has a tolerance, a second line
+    surrounds the cells where the rigid model is sufficient, and crosses stand on undecided cells.
 
     Args:
-        dataset: What `compare` returned; dimensions as in `power_map`.
+        dataset: Result of `compare`; dimensions as in `power_map`.
 
     Raises:
         ValueError: As `power_map`.
@@ -147,12 +161,14 @@ def difference_map(dataset: "xr.Dataset") -> Figure:
 
 
 def _picture(dataset: "xr.Dataset", kind: MapKind) -> Figure:
-    checks.variables("dataset", dataset, kind.needs, kind.made, "variable_map (--show NAME) draws any that there is")
-    whole = dataset[kind.coloured]
-    layout({str(dim): size for dim, size in whole.sizes.items()})
+    validation.validate_dataset(
+        "dataset", dataset, kind.needs, kind.producer, "variable_map (--show NAME) draws any that there is"
+    )
+    coloured = dataset[kind.coloured]
+    layout({str(dim): size for dim, size in coloured.sizes.items()})
     names = list(dict.fromkeys([*kind.needs, *(name for name in kind.optional if name in dataset)]))
-    # A variable lacks the dimensions that it does not depend on; the picture wants them all.
-    full = {name: dataset[name].broadcast_like(whole).transpose(*whole.dims) for name in names}
+    # A variable lacks the dimensions on which it does not depend; the picture requires all of them.
+    full = {name: dataset[name].broadcast_like(coloured).transpose(*coloured.dims) for name in names}
     dataset = numbered(dataset.assign(full)[names]).squeeze()
     dims = [str(dim) for dim in dataset[kind.coloured].dims]
     figure = _curve(dataset, kind) if len(dims) == 1 else _maps(dataset, kind, dims)
@@ -173,12 +189,12 @@ def _maps(dataset: "xr.Dataset", kind: MapKind, dims: list[str]) -> Figure:
 
 def _panel(axes: Axes, panel: "xr.Dataset", kind: MapKind, x: str, y: str, norm: Normalize) -> QuadMesh:
     across, up = (edges(panel[dim].values)[0] for dim in (x, y))
-    # matplotlib takes infinities for missing.
+    # matplotlib treats infinities as missing values.
     values = np.minimum(panel[kind.coloured].values, np.finfo(float).max)
     mesh = axes.pcolormesh(
         across, up, np.ma.masked_where(~has_colour(values, norm), values), norm=norm, rasterized=True
     )
-    _mark_map(axes, kind.marks(panel), (panel[x].values, panel[y].values), (across, up))
+    _mark_map(axes, kind.markers(panel), (panel[x].values, panel[y].values), (across, up))
     return mesh
 
 
@@ -193,11 +209,11 @@ def _curve(dataset: "xr.Dataset", kind: MapKind) -> Figure:
     norm = kind.colours(dataset)
     yscale = "log" if isinstance(norm, LogNorm) else "linear"
     axes.set(xscale=xscale, yscale=yscale, xlim=across[[0, -1]], xlabel=axis_label(dataset[x]), ylabel=kind.label)
-    drawn = has_colour(values, norm) & np.isfinite(values)
-    axes.plot(places, np.where(drawn, values, np.nan), color="tab:blue", linewidth=0.9, zorder=1)
+    has_value = has_colour(values, norm) & np.isfinite(values)
+    axes.plot(places, np.where(has_value, values, np.nan), color="tab:blue", linewidth=0.9, zorder=1)
     axes.margins(y=0.05)
     label_logs(axes)
-    _mark_curve(axes, kind.marks(dataset), places, across, values)
+    _mark_curve(axes, kind.markers(dataset), places, across, values)
     if peak is not None:
         axes.plot(peak[x], dataset[kind.coloured].sel({x: peak[x]}), **_STAR, zorder=5)
     _explain(figure, dataset, kind, peak)
@@ -209,19 +225,19 @@ def _peak(dataset: "xr.Dataset") -> "xr.DataArray | None":
 
 
 def _mark_map(
-    axes: Axes, marks: list[Mark], places: tuple[np.ndarray, np.ndarray], around: tuple[np.ndarray, np.ndarray]
+    axes: Axes, markers: list[Marker], places: tuple[np.ndarray, np.ndarray], cell_edges: tuple[np.ndarray, np.ndarray]
 ) -> None:
-    for mask, how, style, _ in marks:
+    for mask, how, style, _ in markers:
         if how == "veil":
-            veil(axes, *around, mask)
+            veil(axes, *cell_edges, mask)
         elif how == "border":
-            axes.add_collection(LineCollection(borders(*around, mask), **style))
+            axes.add_collection(LineCollection(borders(*cell_edges, mask), **style))
         elif how != "bare":
             axes.plot(*marked_places(mask, *places, most=how == "most"), **style)
 
 
-def _mark_curve(axes: Axes, marks: list[Mark], places: np.ndarray, across: np.ndarray, values: np.ndarray) -> None:
-    for mask, how, style, _ in marks:
+def _mark_curve(axes: Axes, markers: list[Marker], places: np.ndarray, across: np.ndarray, values: np.ndarray) -> None:
+    for mask, how, style, _ in markers:
         if how == "veil":
             for start, end in runs(mask):
                 axes.axvspan(across[start], across[end], **style, zorder=0)
@@ -233,18 +249,21 @@ def _mark_curve(axes: Axes, marks: list[Mark], places: np.ndarray, across: np.nd
 
 
 def has_colour(values: np.ndarray, norm: Normalize) -> np.ndarray:
-    """Say which values have a colour."""
+    """Return True for values that have a colour."""
     return values > 0 if isinstance(norm, LogNorm) else ~np.isnan(values)
 
 
 def _spanned(dataset: "xr.Dataset", values: np.ndarray) -> tuple[np.ndarray, int]:
-    """Find what colours span, over how many decades at most: admissible cells, as outside formulas may give any number.
+    """Return the values that the colours span (admissible ones, or all if few are admissible), and the most decades.
 
-    Where these are few, all that is shown: or the colours would tell nothing of what is around them.
+    Outside of the admissible cells the formula of P may return any number. If admissible cells are few, colours that
+    span them alone would show nothing of their surroundings.
     """
-    drawn = np.isfinite(values)
-    trusted = drawn & dataset["admissible"].values if "admissible" in dataset else drawn
-    return (values[trusted], _DECADES) if trusted.sum() >= _ENOUGH * drawn.sum() else (values[drawn], _ALL_DECADES)
+    finite = np.isfinite(values)
+    admissible = finite & dataset["admissible"].values if "admissible" in dataset else finite
+    return (
+        (values[admissible], _DECADES) if admissible.sum() >= _ENOUGH * finite.sum() else (values[finite], _ALL_DECADES)
+    )
 
 
 def _log_colours(values: np.ndarray, decades: int) -> LogNorm:
@@ -253,71 +272,74 @@ def _log_colours(values: np.ndarray, decades: int) -> LogNorm:
 
 def _power_colours(dataset: "xr.Dataset") -> LogNorm:
     power = dataset["P"].values
-    shown, decades = _spanned(dataset, np.where(power > 0, power, np.nan))
-    return _log_colours(shown, decades) if shown.size else LogNorm(1e-9, 1e-6)
+    spanned, decades = _spanned(dataset, np.where(power > 0, power, np.nan))
+    return _log_colours(spanned, decades) if spanned.size else LogNorm(1e-9, 1e-6)
 
 
-def _common_marks(dataset: "xr.Dataset") -> list[Mark]:
-    """Make marks of what a map holds besides what is coloured."""
-    marks = []
+def _common_markers(dataset: "xr.Dataset") -> list[Marker]:
+    """Return the marks of `admissible`, `period`, `attractors` and `undecided`, if the map has these variables."""
+    markers = []
     if "admissible" in dataset:
-        marks.append(Mark(~dataset["admissible"].values, "veil", VEIL, "inadmissible"))
+        markers.append(Marker(~dataset["admissible"].values, "veil", VEIL, "inadmissible"))
     if "period" in dataset:
         period = dataset["period"].values
-        # Of a window nobody asked what the motion is: it is left undecided everywhere.
-        unknown = (period < 0) & (dataset.attrs.get("until") != "window")
-        marks += [
-            Mark(period == 1, "border", _LINE, "border of period 1"),
-            Mark(period == 0, "most", _DOT, "aperiodic"),
-            Mark(unknown, "any", _CROSS, "undecided"),
+        # With until="window" the period is not determined: it is undecided in every cell, and marks would show nothing.
+        undecided = (period < 0) & (dataset.attrs.get("until") != "window")
+        markers += [
+            Marker(period == 1, "border", _LINE, "border of period 1"),
+            Marker(period == 0, "most", _DOT, "aperiodic"),
+            Marker(undecided, "any", _CROSS, "undecided"),
         ]
     if "attractors" in dataset:
-        marks.append(Mark(dataset["attractors"].values > 1, "border", _LINE, "border of several attractors"))
+        markers.append(Marker(dataset["attractors"].values > 1, "border", _LINE, "border of several attractors"))
     if "undecided" in dataset:
-        marks.append(Mark(dataset["undecided"].values > 0, "any", _CROSS, "starts undecided"))
-    return marks
+        markers.append(Marker(dataset["undecided"].values > 0, "any", _CROSS, "starts undecided"))
+    return markers
 
 
-def _power_marks(dataset: "xr.Dataset") -> list[Mark]:
-    return [*_common_marks(dataset), Mark(dataset["P"].values == 0, "bare", BARE, "no impact")]
+def _power_markers(dataset: "xr.Dataset") -> list[Marker]:
+    return [*_common_markers(dataset), Marker(dataset["P"].values == 0, "bare", BARE, "no impact")]
 
 
 def _number_colours(name: str, dataset: "xr.Dataset") -> Normalize:
-    shown, decades = _spanned(dataset, dataset[name].values)
-    positive = shown[shown > 0]
-    if positive.size and shown.min() >= 0 and positive.max() > _WIDE * positive.min():
+    spanned, decades = _spanned(dataset, dataset[name].values)
+    positive = spanned[spanned > 0]
+    if positive.size and spanned.min() >= 0 and positive.max() > _WIDE * positive.min():
         return _log_colours(positive, decades)
-    return Normalize(shown.min(), shown.max()) if shown.size else Normalize(0, 1)
+    return Normalize(spanned.min(), spanned.max()) if spanned.size else Normalize(0, 1)
 
 
-def _number_marks(name: str, dataset: "xr.Dataset") -> list[Mark]:
-    own = ("period", "attractors", "undecided")
-    others = dataset.drop_vars(name) if name in own else dataset  # its own colours say it
-    none = ~has_colour(dataset[name].values, _number_colours(name, dataset))
-    zero = bool((dataset[name].values[none] == 0).any())
-    return [*_common_marks(others), Mark(none, "bare", BARE, "zero, or no value" if zero else "no value")]
+def _number_markers(name: str, dataset: "xr.Dataset") -> list[Marker]:
+    mark_variables = ("period", "attractors", "undecided")
+    remaining = dataset.drop_vars(name) if name in mark_variables else dataset  # shown by colours already
+    uncoloured = ~has_colour(dataset[name].values, _number_colours(name, dataset))
+    has_zero = bool((dataset[name].values[uncoloured] == 0).any())
+    return [
+        *_common_markers(remaining),
+        Marker(uncoloured, "bare", BARE, "zero, or no value" if has_zero else "no value"),
+    ]
 
 
 def _difference_colours(_: "xr.Dataset") -> LogNorm:
-    """Set one scale for all maps: beyond 1 it matters no more by how much."""
+    """Return one scale for all maps, from 1e-4 to 1, because differences above 1 need no resolution."""
     return LogNorm(10.0**-_DECADES, 1.0)
 
 
-def _difference_marks(dataset: "xr.Dataset") -> list[Mark]:
-    differs = dataset["label"].values == Label.DIFFERS
-    marks = [Mark(differs, "border", _LINE, "border of other labels")]
+def _difference_markers(dataset: "xr.Dataset") -> list[Marker]:
+    differs = dataset["label"].values == LabelAgreement.DIFFERS
+    markers = [Marker(differs, "border", _LINE, "border of other labels")]
     if "cheapest_model" in dataset:
-        verdict = dataset["cheapest_model"]
-        within = f"{100 * verdict.attrs['tolerance']:.4g} %"
-        marks += [
-            Mark(verdict.values == Model.RIGID, "border", _OUTLINE, f"rigid is enough within {within}"),
-            Mark(verdict.values == Model.UNDECIDED, "any", _CROSS | {"color": "orange"}, "undecided"),
+        model = dataset["cheapest_model"]
+        within = f"{100 * model.attrs['tolerance']:.4g} %"
+        markers += [
+            Marker(model.values == CheapestModel.RIGID, "border", _OUTLINE, f"rigid is enough within {within}"),
+            Marker(model.values == CheapestModel.UNDECIDED, "any", _CROSS | {"color": "orange"}, "undecided"),
         ]
     bare = ~(dataset["relative_difference"].values > 0)
-    return [*marks, Mark(bare, "bare", BARE, "no difference, or failed")]
+    return [*markers, Marker(bare, "bare", BARE, "no difference, or failed")]
 
 
-POWER = MapKind("P", QUANTITIES["P"], "sweep", NEEDS, (), _power_colours, _power_marks)
+POWER = MapKind("P", QUANTITIES["P"], "sweep", NEEDS, (), _power_colours, _power_markers)
 _EXPECTED = POWER._replace(label=f"{QUANTITIES['P']}, mean over starts", needs=EXPECTED_NEEDS)
 _DIFFERENCE = MapKind(
     "relative_difference",
@@ -326,22 +348,22 @@ _DIFFERENCE = MapKind(
     ("relative_difference", "label"),
     ("cheapest_model",),
     _difference_colours,
-    _difference_marks,
+    _difference_markers,
 )
 
 
 def _explain(figure: Figure, dataset: "xr.Dataset", kind: MapKind, peak: "xr.DataArray | None") -> None:
-    """Explain above what the map holds constant, below what its marks mean; only the marks that it has."""
+    """Write the map's constants above, and the meaning of the occurring marks below."""
     figure.suptitle(title(dataset), fontsize="medium")
-    shown = [(_handle(mark), mark.text) for mark in kind.marks(dataset) if mark.mask.any()]
+    legend = [(_handle(marker), marker.text) for marker in kind.markers(dataset) if marker.mask.any()]
     if peak is not None:
         amount = EngFormatter("J", places=2)(float(peak))
-        shown.append((Line2D([], [], **_STAR), f"largest admissible $P$, {amount}"))
-    handles, texts = zip(*shown, strict=True) if shown else ((), ())
+        legend.append((Line2D([], [], **_STAR), f"largest admissible $P$, {amount}"))
+    handles, texts = zip(*legend, strict=True) if legend else ((), ())
     figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.6)
 
 
-def _handle(mark: Mark) -> Patch | Line2D:
-    if mark.how in ("veil", "bare"):
-        return Patch(**mark.style)
-    return Line2D([], [], **mark.style if mark.how == "border" else mark.style | _SINGLE)
+def _handle(marker: Marker) -> Patch | Line2D:
+    if marker.how in ("veil", "bare"):
+        return Patch(**marker.style)
+    return Line2D([], [], **marker.style if marker.how == "border" else marker.style | _SINGLE)

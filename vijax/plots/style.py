@@ -1,6 +1,6 @@
-"""What all pictures share: fonts, files and their mark, how quantities are written, in how many panels a map fits.
+"""Shared properties of all pictures: fonts, file formats and their mark, text of quantities, layout of panels.
 
-Known before a run: nothing here loads matplotlib.
+This module does not load matplotlib, so that its checks can precede a simulation without delay.
 """
 
 import itertools
@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vijax.model.quantities import MEASURED, PARAMETERS, synonyms
-from vijax.runtime import checks
+from vijax.model.quantities import PARAMETERS, RESULT_QUANTITIES, synonyms
+from vijax.runtime import validation
 from vijax.runtime.files import replacing
 
 if TYPE_CHECKING:
@@ -26,76 +26,77 @@ STYLE: Any = {
     "hatch.linewidth": 0.4,
     "savefig.dpi": 250,
 }
-# Endings of pictures, each with the entry of its metadata that names what drew it.
+# Endings of picture files, each with the metadata entry that names the drawing program.
 _DRAWN_WITH = {".png": "Software", ".pdf": "Creator", ".svg": "Creator", ".eps": "Creator"}
 _MARK = "drawn by vijax"
-# Worth a place in the title: neither the start, nor a quantity under a second name. Those a physical sweep may hold.
+# Parameters in a title, one name per quantity and without the start. `FURTHER` are the other names of these quantities,
+# which sweeps of physical parameters have.
 CONSTANTS = tuple(name for name in PARAMETERS if name == synonyms(name)[0])
 FURTHER = tuple(name for name in PARAMETERS if name not in CONSTANTS)
 
 
 def check_format(path: str | Path) -> None:
-    """Raise ValueError unless the path ends as a picture does."""
-    if checks.path("plot", path).suffix not in _DRAWN_WITH:
-        raise ValueError(f"plot must end in {', '.join(_DRAWN_WITH)}; got {checks.shown(str(path))}")
+    """Raise ValueError unless the path has the ending of a picture."""
+    if validation.validate_path("plot", path).suffix not in _DRAWN_WITH:
+        raise ValueError(f"plot must end in {', '.join(_DRAWN_WITH)}; got {validation.value_text(str(path))}")
 
 
 def save_figure(figure: Any, path: str | Path) -> None:
-    """Save a picture, whole or not at all, with a mark by which `is_drawn` knows it."""
+    """Save a picture, completely or not at all, with the mark that `is_drawn` recognises."""
     check_format(path)
     with replacing(Path(path)) as part:
         figure.savefig(part, metadata={_DRAWN_WITH[part.suffix]: _MARK})
 
 
 def is_drawn(path: Path) -> bool:
-    """Tell whether a file is a picture that vijax drew and nothing else has saved since."""
+    """Return True if a file is a picture drawn by vijax and not saved by another program since."""
     return path.is_file() and _MARK.encode() in path.read_bytes()
 
 
 def title(dataset: "xr.Dataset", further: tuple[str, ...] = ()) -> str:
-    """Say what a dataset holds constant: its wall, its scalar parameters, and `further` ones where they are given."""
+    """Return the constants of a dataset as text: its wall, its scalar parameters, and `further` ones if present."""
     names = [name for name in (*CONSTANTS, *further) if name in dataset.coords and not dataset[name].ndim]
     wall = [f"{dataset.attrs['wall']} walls"] if "wall" in dataset.attrs else []
     return ", ".join([*wall, equations(dataset, names)])
 
 
 def axis_label(coordinate: "xr.DataArray") -> str:
-    """Write symbol and units of a coordinate: omega [rad/s]."""
-    written = units(coordinate)
-    return symbol(coordinate) + (f" [{written}]" if written else "")
+    """Return symbol and units of a coordinate: omega [rad/s]."""
+    unit_text = units(coordinate)
+    return symbol(coordinate) + (f" [{unit_text}]" if unit_text else "")
 
 
 def symbol(coordinate: "xr.DataArray") -> str:
-    """Give the symbol of a coordinate, or its name."""
+    """Return the symbol of a coordinate, or its name."""
     return f"${coordinate.attrs.get('symbol', coordinate.name)}$"
 
 
 def equations(dataset: "xr.Dataset", names: list[str]) -> str:
-    """Write the values of scalar coordinates: r = 0.5, omega = 3.14 rad/s."""
+    """Return the values of scalar coordinates as text: r = 0.5, omega = 3.14 rad/s."""
     scalars = [dataset[name] for name in names]
     return ", ".join(f"{symbol(scalar)} = {float(scalar):.4g} {units(scalar)}".strip() for scalar in scalars)
 
 
 def units(coordinate: "xr.DataArray") -> str:
-    """Give the units of a coordinate for print; none of a pure number."""
-    plain = coordinate.attrs.get("units", "1")
-    return "" if plain == "1" else re.sub(r"(-?\d+)", r"$^{\1}$", plain)
+    """Return the units of a coordinate with exponents as superscripts of mathtext; "" for a pure number."""
+    unit_text = coordinate.attrs.get("units", "1")
+    return "" if unit_text == "1" else re.sub(r"(-?\d+)", r"$^{\1}$", unit_text)
 
 
 NEEDS = ("P", "period", "admissible")
 EXPECTED_NEEDS = ("P", "attractors", "undecided", "admissible")
 LABEL_NEEDS = ("period", "impacts_left", "impacts_right", "status")
-MOST_PANELS = 36  # A map has so many at most: more are too small to read.
+MOST_PANELS = 36  # most panels of a map; more would be too small to read
 
 
 def layout(sizes: Mapping[str, int]) -> tuple[int, int]:
-    """Lay panels in rows and columns for a map whose dimensions are, in order, x, y, columns and rows.
+    """Return the rows and columns of panels for a map with the dimensions x, y, columns and rows, in this order.
 
     Args:
-        sizes: Length of every dimension of P; those of length one are not drawn.
+        sizes: Length of every dimension of P; dimensions of length one are not drawn.
 
     Raises:
-        ValueError: If no picture can be made of it: why, and what to take away.
+        ValueError: No picture can show the map; the message states the reason and the dimensions to remove.
     """
     drawn = {dim: size for dim, size in sizes.items() if size > 1}
     if not drawn:
@@ -112,7 +113,7 @@ def layout(sizes: Mapping[str, int]) -> tuple[int, int]:
 
 
 def layout_of_kinds(sizes: Mapping[str, int]) -> tuple[int, int]:
-    """Lay panels as `layout` does, for a map of labels or basins, which a curve cannot show."""
+    """Return the rows and columns of panels as `layout` does; raise ValueError if a map of kinds has a single axis."""
     drawn = [dim for dim, size in sizes.items() if size > 1]
     if len(drawn) == 1:
         raise ValueError(f"plot must have two axes of more than one value; got {drawn[0]} alone")
@@ -120,8 +121,8 @@ def layout_of_kinds(sizes: Mapping[str, int]) -> tuple[int, int]:
 
 
 def is_kind(variable: Any) -> bool:
-    """Say whether a variable tells of what kind a cell is, and not how much there is of something."""
+    """Return True if a variable is a kind (boolean or with flags) and not an amount."""
     return variable.dtype == bool or "flag_values" in variable.attrs
 
 
-QUANTITIES = {name: measured.label for name, measured in MEASURED.items() if measured.label}
+QUANTITIES = {name: measured.label for name, measured in RESULT_QUANTITIES.items() if measured.label}

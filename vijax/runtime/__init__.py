@@ -1,5 +1,5 @@
-"""What JAX, the machine and the disk ask of us; no physics.
+"""Services for JAX, the machine and the disk, independent of the physics.
 
-Kernels of XLA, small linear systems, padded tiles of calls, programs kept on disk, files written whole, checks of
-arguments. Begin with `tiles`, by which computations on many rows are called.
+Compiled programs and their cache (`compilation`), numerical methods (`numerics`), padded tiles of calls, files written
+atomically, validation of arguments. Begin with `tiles`, which calls compiled programs on any number of rows.
 """

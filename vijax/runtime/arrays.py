@@ -1,8 +1,8 @@
-"""What annotations call arrays: where one need not be JAX's, and the shapes that occur everywhere.
+"""Array types for annotations, for arrays that need not be JAX's and for frequent shapes; small helpers on arrays.
 
-Records of cells are made by NumPy on the host, as JAX would compile a program for every shape, are traced in programs,
-and stand for their own shapes where a layout is asked for. `Float[AnyArray, ...]` says so, `Float[Array, ...]` of
-jaxtyping that nothing but JAX comes there; both are checked when tests run.
+Records of cells are made by NumPy on the host (JAX would compile a program for every shape), are traced in programs,
+and appear as shapes where a layout is computed. `Float[AnyArray, ...]` permits all three, `Float[Array, ...]` of
+jaxtyping only JAX's arrays; the tests check both at run time.
 """
 
 from typing import TYPE_CHECKING, TypeVar
@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 if TYPE_CHECKING:
-    AnyArray = jax.Array  # else mypy asks of every operator and method what it does to each kind
+    AnyArray = jax.Array  # for mypy: otherwise every operator and method must exist for each kind
 else:
     AnyArray = jax.Array | np.ndarray | np.generic | jax.ShapeDtypeStruct
 
-# One number or truth of one ball; one a lane; any number of them.
+# A scalar number or truth value of one ball; one value per lane; any number of values.
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
 Lane = Float[AnyArray, "lane"]
@@ -28,20 +28,21 @@ Flags = Bool[AnyArray, "..."]
 T = TypeVar("T")
 
 
-def present(value: T | None) -> T:
-    """Return a field that is None in programs that do not need it, where a program is made that does.
+def not_none(value: T | None) -> T:
+    """Return a field that is None only in programs that do not use it, in a program that uses it.
 
-    Which one it is, is a static choice made elsewhere, which a type checker cannot follow.
+    A static choice, which a type checker cannot follow, decides whether the field is None.
     """
     assert value is not None
     return value
 
 
-def choose(mask: Bool[Array, "*lane"], new: T, old: T) -> T:
-    """Take `new` where the mask is true, else `old`, leaf by leaf and lane by lane; there may be one ball alone."""
+def select(mask: Bool[Array, "*lane"], new: T, old: T) -> T:
+    """Return `new` where the mask is True, else `old`, leaf by leaf; the mask has an axis of lanes, or none."""
+    # The mask is padded with trailing axes to broadcast over the leaf's further axes.
     return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)
 
 
-def nearest(x: Values) -> Values:
-    """Find the nearest whole number, the one above where two are as near: kernels for a GPU know no other rounding."""
+def round_half_up(x: Values) -> Values:
+    """Return the nearest integer, with ties rounded up: kernels for a GPU have no other rounding."""
     return jnp.floor(x + 0.5)

@@ -1,0 +1,4 @@
+"""The subcommands of `vijax`, one module each.
+
+Begin with `sweep`.
+"""

@@ -1,0 +1,4 @@
+"""Survey of the motions of many devices, as starts of ascents.
+
+Begin with `device_survey`.
+"""
