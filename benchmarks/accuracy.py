@@ -237,7 +237,7 @@ def steady_states(count: int) -> None:
     )
     print_figure("steady states called OK that the impact map does not fly", wrong, 0, note)
     print_figure("steady states called VIRTUAL that it flies", lost, 0)
-    print_figure("largest relative difference of P from the flown orbit's", worst, 1e-10)
+    print_figure("largest relative difference of P from the simulated orbit's", worst, 1e-10)
 
 
 def _steady_states(device: Harvester, pair: ImpactPair, sequence: Sequence, impact_unknowns: np.ndarray) -> Steady:

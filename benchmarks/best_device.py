@@ -235,7 +235,7 @@ def _again(part: str, devices: list[Harvester], designs: list[Design]) -> None:
         noise = math.hypot(optimum.P_stderr, float(P.std(ddof=1)) / math.sqrt(balls))
         deviations.append(abs(float(P.mean()) - optimum.P) / noise if noise > 1e-9 * optimum.P else 0.0)
     print_figure(
-        f"{part}: answers in chaos flown again, {balls} x {periods:,} periods: within limits",
+        f"{part}: answers in chaos simulated again, {balls} x {periods:,} periods: within limits",
         f"{sum(is_admissible)} of {len(is_admissible)}",
     )
     print_figure(

@@ -197,7 +197,7 @@ def main() -> int:
     """Measure or draw, as the command line selects."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--clicks", type=int, default=100, help="cells that are clicked on [100]")
-    parser.add_argument("--long", type=int, default=1000, help="clicks over which memory is looked at [1000]")
+    parser.add_argument("--long", type=int, default=1000, help="clicks during which memory is measured [1000]")
     parser.add_argument("--picture", metavar="FILE.png", help="draw the page instead")
     parser.add_argument("--size", default="1280x800", metavar="WxH", help="of the picture [1280x800]")
     options = parser.parse_args()

@@ -570,7 +570,7 @@ SCENES = {
     "single_precision": Scene(
         single_precision,
         "seven digits: errors grow from impact to impact, some cells change their label",
-        'float64 unless asked; `dtype="float32"` widens its tolerances',
+        'float64 by default; `dtype="float32"` widens its tolerances',
     ),
 }
 

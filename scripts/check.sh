@@ -49,6 +49,6 @@ wait "$types" || failed=$?
 cat "$environment/types.txt"
 # Printed last, as a line among the reasons of skipped tests is overlooked.
 if ! command -v chromium chromium-browser google-chrome >/dev/null; then
-  echo "SKIPPED: pages were not looked at in a browser (tests/explorer/test_browser.py), as no Chromium is installed; apt-get install chromium brings it on Debian"
+  echo "SKIPPED: pages were not tested in a browser (tests/explorer/test_browser.py), as no Chromium is installed; apt-get install chromium brings it on Debian"
 fi
 exit "$failed"

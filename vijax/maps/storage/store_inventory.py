@@ -20,7 +20,7 @@ from vijax.runtime import validation
 from vijax.runtime.doc_pages import see
 from vijax.runtime.files import json_bytes
 
-# Names of entries in the JSON files of earlier versions, and their names now.
+# Former names of entries in the JSON files of stores, and their present names.
 _RENAMED_ENTRIES = {"birth": "store_id"}
 
 

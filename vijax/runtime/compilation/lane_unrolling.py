@@ -114,6 +114,7 @@ def _along_first(rows: Rows) -> list[Rows]:
 
 
 def _unsupported(operation: str) -> NotImplementedError:
+    """Return the error for work that contains an operation which cannot be mapped to single lanes."""
     return NotImplementedError(
         f"unrolled work must not {operation}; vijax.runtime.compilation.lane_unrolling lists the operations it may use"
     )
